@@ -1,0 +1,38 @@
+"""anchorscan: where a robot is, from one 2D laser scan and no prior guess.
+
+Public names are loaded when first used, so that importing the package costs nothing.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+__version__ = "0.1.0"
+
+# The public names and the module that holds each: the one list behind __all__.
+_HOMES = {
+    "AnchorscanError": "errors",
+    "Hypothesis": "hypothesis",
+    "LaserScan": "scan",
+    "LogError": "errors",
+    "MissingExtraError": "errors",
+    "Pose2D": "pose",
+    "Record": "record",
+    "Reference": "reference",
+    "ReferenceSetError": "errors",
+    "ScanError": "errors",
+    "SettingsError": "errors",
+}
+
+__all__ = sorted([*_HOMES, "__version__"])  # noqa: PLE0605 - the list is one with _HOMES
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(f".{_HOMES[name]}", __name__), name)
+
+
+def __dir__() -> list[str]:
+    return __all__

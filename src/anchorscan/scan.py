@@ -1,0 +1,140 @@
+"""The laser scan: ranges over angles, with the fields and the validity rules of ROS.
+
+Fields are those of ``sensor_msgs/LaserScan``; special values follow REP-117:
+``+inf`` is "nothing within reach" (free space is known), ``-inf`` is "too close",
+NaN is "no information".  A reading is a *return* when
+``range_min <= range <= range_max``, which NaN fails.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from .errors import ScanError
+
+__all__ = ["LaserScan"]
+
+# A reading that misses the full turn by less than this share of an increment still closes it.
+_CLOSING_SLACK = 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class LaserScan:
+    """One 2D laser scan in the frame of the laser.
+
+    Reading ``i`` looks along ``angle_min + i * angle_increment`` (radians about +z,
+    zero along +x).  A negative increment is a sensor that turns clockwise.
+
+    Args:
+        ranges: (N,) metres; stored as a read-only float32 copy, as ROS carries them.
+        angle_min: Direction of the first reading, radians.
+        angle_increment: Angle between readings, radians, not zero.
+        range_min: Shortest range that counts, metres.
+        range_max: Longest range that counts, metres.
+
+    Raises:
+        ScanError: ``ranges`` is not one-dimensional, the geometry is not finite, the
+            increment is zero, or the limits are out of order.
+    """
+
+    ranges: NDArray[np.float32]
+    angle_min: float
+    angle_increment: float
+    range_min: float = 0.0
+    range_max: float = 80.0
+
+    def __post_init__(self) -> None:
+        try:
+            with np.errstate(over="ignore"):
+                ranges = np.array(self.ranges, dtype=np.float32)
+        except (TypeError, ValueError) as error:
+            raise ScanError(f"ranges are not numbers: {error}") from None
+        if ranges.ndim != 1:
+            raise ScanError(f"ranges must have one dimension, not shape {ranges.shape}")
+        for name in ("angle_min", "angle_increment", "range_min"):
+            if not math.isfinite(getattr(self, name)):
+                raise ScanError(f"{name} must be finite, not {getattr(self, name)}")
+        if self.angle_increment == 0.0 and len(ranges) > 1:
+            raise ScanError("angle_increment must not be zero")
+        if abs(self.angle_increment) * len(ranges) > 4.0 * math.pi:
+            raise ScanError("the readings span more than two turns; is angle_increment in degrees?")
+        if not 0.0 <= self.range_min < self.range_max:
+            raise ScanError(
+                f"range limits are out of order: {self.range_min} to {self.range_max}"
+            )
+        ranges.setflags(write=False)
+        object.__setattr__(self, "ranges", ranges)
+        for name in ("angle_min", "angle_increment", "range_min", "range_max"):
+            object.__setattr__(self, name, float(getattr(self, name)))
+
+    @classmethod
+    def from_field_of_view(
+        cls,
+        ranges: ArrayLike,
+        field_of_view: float,
+        *,
+        range_min: float = 0.0,
+        range_max: float = 80.0,
+    ) -> LaserScan:
+        """Build a scan that looks symmetrically about +x, counter-clockwise.
+
+        Args:
+            ranges: (N,) metres.
+            field_of_view: Angle from the first to the last reading, radians.
+            range_min: Shortest range that counts, metres.
+            range_max: Longest range that counts, metres.
+
+        Raises:
+            ScanError: As for the constructor.
+        """
+        count = len(np.atleast_1d(np.asarray(ranges)))
+        increment = field_of_view / max(count - 1, 1)
+        return cls(np.asarray(ranges), -0.5 * field_of_view, increment, range_min, range_max)
+
+    def __len__(self) -> int:
+        return len(self.ranges)
+
+    @cached_property
+    def angles(self) -> NDArray[np.float64]:
+        """(N,) direction of every reading, radians, scan frame."""
+        return self.angle_min + self.angle_increment * np.arange(len(self.ranges))
+
+    @cached_property
+    def is_return(self) -> NDArray[np.bool_]:
+        """(N,) whether the reading hit something within the limits."""
+        ranges = self.ranges
+        return (
+            (ranges >= self.range_min)
+            & (ranges <= self.range_max)
+            & (ranges > 0.0)
+            & np.isfinite(ranges)
+        )
+
+    @cached_property
+    def is_free(self) -> NDArray[np.bool_]:
+        """(N,) whether the reading found nothing within reach (REP-117 ``+inf``)."""
+        with np.errstate(invalid="ignore"):
+            return np.asarray(self.ranges > self.range_max)
+
+    @cached_property
+    def points(self) -> NDArray[np.float64]:
+        """(V, 2) end points of the returns, metres, scan frame, in the order of the readings."""
+        ranges = self.ranges[self.is_return].astype(np.float64)
+        angles = self.angles[self.is_return]
+        return np.column_stack((ranges * np.cos(angles), ranges * np.sin(angles)))
+
+    @property
+    def field_of_view(self) -> float:
+        """Angle from the first to the last reading, radians, not negative."""
+        return abs(self.angle_increment) * max(len(self.ranges) - 1, 0)
+
+    @property
+    def is_full_turn(self) -> bool:
+        """Whether the last reading is followed by the first, as with a 360 degree sensor."""
+        step = abs(self.angle_increment)
+        return len(self.ranges) > 2 and step * (len(self.ranges) + _CLOSING_SLACK) >= 2.0 * math.pi
