@@ -1,0 +1,28 @@
+"""Fixtures: where real logs lie, and what to say when they are absent."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+DATA = Path(
+    os.environ.get(
+        "ANCHORSCAN_DATA", Path(__file__).resolve().parents[1] / ".." / "shared" / "data"
+    )
+)
+
+
+@pytest.fixture(scope="session")
+def data_file() -> Callable[[str], Path]:
+    """Give the path of a file in the data folder, or skip the test when it is absent."""
+
+    def find(name: str) -> Path:
+        path = DATA / name
+        if not path.exists():
+            pytest.skip(f"{name} is not in {DATA} (set ANCHORSCAN_DATA to the folder of the logs)")
+        return path
+
+    return find
