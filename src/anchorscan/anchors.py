@@ -1,0 +1,451 @@
+"""Section 3: extraction of jump edge, angle and virtual edge anchor points.
+
+An anchor point is a position that another scan of the same place finds again.
+
+*Jump edge* anchors stand at the near surface's margin where the range jumps from near to
+far.  At the visibility rim of a round object the ray grazes the surface; there the angle
+between ray and surface is too small and no anchor is made.
+
+*Angle* anchors stand where two surfaces meet: the surface angle changes within a segment.
+The position is the intersection of the two lines fitted to either side, not the nearest
+reading.
+
+*Virtual edge* anchors combine the peaks of the x- and the y-histogram: the distributions
+of the scan's points along the main angle and across it.  Every further peak of the angle
+histogram gives its own pair of histograms (the paper's remark on its reference [12]).
+
+Departures from the paper: an anchor also carries its kind and the direction of the free
+space before it, and each histogram is kept apart for the two sides from which its wall can
+be seen (``facing``); the ``paper`` preset switches the latter off and its matching ignores
+both.  A wall adds to a histogram only where its surface runs across that axis, which keeps
+the walls of the other direction from filling it evenly.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from enum import IntEnum
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field
+
+from ._jit import kernel
+from .angle_function import (
+    CONNECTED,
+    FREE,
+    TO_FAR,
+    TO_NEAR,
+    AngleFunction,
+    AngleFunctionSettings,
+    angle_function,
+    line_through,
+    walked,
+    wrapped,
+)
+from .scan import LaserScan
+from .segments import Segments, SegmentSettings, segments
+
+__all__ = [
+    "AnchorKind",
+    "AnchorPoints",
+    "AnchorSettings",
+    "VirtualEdges",
+    "anchor_points",
+    "angle_anchors",
+    "jump_edge_anchors",
+    "virtual_edges",
+]
+
+
+class AnchorKind(IntEnum):
+    """What an anchor point is; left and right as seen from the sensor."""
+
+    JUMP_EDGE_LEFT = 0
+    JUMP_EDGE_RIGHT = 1
+    CONVEX_ANGLE = 2
+    CONCAVE_ANGLE = 3
+    VIRTUAL_EDGE = 4
+
+
+class AnchorSettings(BaseModel):
+    """Settings of sections 2 and 3, from scan to anchor points."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    angle_function: AngleFunctionSettings = AngleFunctionSettings()
+    segments: SegmentSettings = SegmentSettings()
+    smallest_rim_angle: float = Field(
+        math.radians(20.0), ge=0.0, description="ray to surface at a jump edge, radians"
+    )
+    smallest_turn: float = Field(
+        math.radians(40.0), gt=0.0, description="change of surface angle at an anchor, radians"
+    )
+    arm: float = Field(0.4, gt=0.0, description="way along each surface that its line is fitted to")
+    shortest_arm: float = Field(0.2, gt=0.0, description="shortest such way, metres")
+    flatness: float = Field(0.04, gt=0.0, description="largest rms error of such a line, metres")
+    farthest_corner: float = Field(
+        0.2, gt=0.0, description="intersection to nearest reading, metres"
+    )
+    histogram_bin: float = Field(0.1, gt=0.0, description="bin of the x- and y-histograms, metres")
+    smallest_wall: float = Field(0.8, gt=0.0, description="surface that makes a peak, metres")
+    most_walls: int = Field(4, ge=0, description="peaks taken of each histogram")
+    facing: bool = Field(False, description="tell the two sides of a wall apart")
+    wall_angle: float = Field(math.radians(15.0), gt=0.0, description="surface to axis, radians")
+    most_main_angles: int = Field(2, ge=1, description="main angles that give histograms")
+    smallest_main_share: float = Field(
+        0.3, gt=0.0, le=1.0, description="weight of a further main angle, share of the first"
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class AnchorPoints:
+    """The anchor points of one scan.
+
+    Args:
+        positions: (A, 2) metres, scan frame.
+        kinds: (A,) of ``AnchorKind``.
+        directions: (A,) direction of the free space before the anchor, radians.
+        main_angle: Direction of the main walls, radians modulo 90 degrees, scan frame; NaN
+            where no surface tells.
+    """
+
+    positions: NDArray[np.float64]
+    kinds: NDArray[np.int64]
+    directions: NDArray[np.float64]
+    main_angle: float = math.nan
+
+    def __len__(self) -> int:
+        return len(self.kinds)
+
+
+@dataclass(frozen=True, eq=False)
+class VirtualEdges:
+    """The walls behind the virtual edges of one main angle.
+
+    Args:
+        main_angle: Direction of the x axis of the wall frame, radians, scan frame.
+        histograms: (2, 2, B) length of surface per bin of x and of y; the second index is
+            the side that is seen (towards plus, towards minus; 0 for both if not told apart).
+        origin: Coordinate of the first bin's lower border, metres.
+        bin_width: Width of a bin, metres.
+        x_walls: (X, 3) coordinate (metres), side (+1, -1 or 0) and length of surface.
+        y_walls: (Y, 3) the same across.
+    """
+
+    main_angle: float
+    histograms: NDArray[np.float64]
+    origin: float
+    bin_width: float
+    x_walls: NDArray[np.float64]
+    y_walls: NDArray[np.float64]
+
+
+def anchor_points(scan: LaserScan, settings: AnchorSettings) -> AnchorPoints:
+    """Extract all anchor points of a scan (section 3)."""
+    angles = angle_function(scan, settings.angle_function)
+    surfaces = segments(angles, settings.segments)
+    edges = virtual_edges(angles, settings)
+    return gather(
+        jump_edge_anchors(angles, surfaces, settings),
+        angle_anchors(angles, surfaces, settings),
+        edges,
+    )
+
+
+def gather(
+    jumps: NDArray[np.float64], turns: NDArray[np.float64], edges: list[VirtualEdges]
+) -> AnchorPoints:
+    """Put the rows of all three extractions together."""
+    rows = np.concatenate(
+        [jumps, turns, *(_crossings(e.main_angle, e.x_walls, e.y_walls) for e in edges)]
+    )
+    return AnchorPoints(
+        np.ascontiguousarray(rows[:, :2]),
+        rows[:, 3].astype(np.int64),
+        np.ascontiguousarray(rows[:, 2]),
+        edges[0].main_angle if edges else math.nan,
+    )
+
+
+def jump_edge_anchors(
+    angles: AngleFunction, surfaces: Segments, settings: AnchorSettings
+) -> NDArray[np.float64]:
+    """Find the jump edge anchors: (J, 4) rows x, y, direction of free space, kind."""
+    return _jump_edges(
+        angles.points,
+        angles.gaps,
+        angles.way,
+        angles.moments,
+        surfaces.first,
+        surfaces.last,
+        (settings.arm, settings.shortest_arm, settings.flatness, settings.smallest_rim_angle),
+    )
+
+
+def angle_anchors(
+    angles: AngleFunction, surfaces: Segments, settings: AnchorSettings
+) -> NDArray[np.float64]:
+    """Find the angle anchors: (C, 4) rows x, y, direction of free space, kind."""
+    return _angle_anchors(
+        angles.points,
+        angles.way,
+        angles.moments,
+        surfaces.first,
+        surfaces.last,
+        (
+            settings.arm,
+            settings.shortest_arm,
+            settings.flatness,
+            settings.smallest_turn,
+            settings.farthest_corner,
+        ),
+    )
+
+
+def virtual_edges(angles: AngleFunction, settings: AnchorSettings) -> list[VirtualEdges]:
+    """Find the walls whose crossings are virtual edge anchors, one value per main angle."""
+    found = []
+    for main in _main_angles(
+        angles.surface,
+        angles.extents,
+        settings.angle_function.bins,
+        settings.most_main_angles,
+        settings.smallest_main_share,
+    ):
+        histograms, origin = _wall_histograms(
+            angles.points,
+            angles.surface,
+            angles.extents,
+            main,
+            settings.histogram_bin,
+            settings.wall_angle,
+            settings.facing,
+        )
+        limits = (origin, settings.histogram_bin, settings.smallest_wall, settings.most_walls)
+        found.append(
+            VirtualEdges(
+                float(main),
+                histograms,
+                origin,
+                settings.histogram_bin,
+                _walls(histograms[0], limits, settings.facing),
+                _walls(histograms[1], limits, settings.facing),
+            )
+        )
+    return found
+
+
+@kernel
+def _jump_edges(points, gaps, way, moments, first, last, limits):  # type: ignore[no-untyped-def]
+    """Margins of large surfaces behind which the range jumps to far."""
+    arm, shortest, flatness, rim = limits
+    count = len(points)
+    rows = np.empty((2 * len(first), 4))
+    found = 0
+    for s in range(len(first)):
+        a, b = first[s], last[s]
+        for side in range(2):
+            at = b if side == 0 else a
+            gap = gaps[b] if side == 0 else gaps[a - 1]
+            near = TO_FAR if side == 0 else TO_NEAR
+            if gap != near and gap != FREE:
+                continue
+            other = at
+            while other != (a if side == 0 else b) and abs(way[other] - way[at]) < arm:
+                other += -1 if side == 0 else 1
+            if abs(way[other] - way[at]) < shortest:
+                continue
+            begin, end = min(at, other), max(at, other)
+            _, _, direction, error = line_through(moments, begin, end)
+            if error > flatness:
+                continue
+            direction = walked(
+                direction, points[end, 0] - points[begin, 0], points[end, 1] - points[begin, 1]
+            )
+            ray = math.atan2(points[at, 1], points[at, 0])
+            if abs(math.sin(direction - ray)) < math.sin(rim):
+                continue
+            rows[found, 0] = points[at, 0]
+            rows[found, 1] = points[at, 1]
+            rows[found, 2] = wrapped(direction + 0.5 * math.pi)
+            rows[found, 3] = side
+            found += 1
+    return rows[:found]
+
+
+@kernel
+def _turn(points, moments, first, here, last, flatness):  # type: ignore[no-untyped-def]
+    """Lines of both arms at a return: turn between them, or 0 where either is not straight."""
+    ax, ay, a, error = line_through(moments, first, here)
+    bx, by, b, error_b = line_through(moments, here, last)
+    a = walked(a, points[here, 0] - points[first, 0], points[here, 1] - points[first, 1])
+    b = walked(b, points[last, 0] - points[here, 0], points[last, 1] - points[here, 1])
+    turn = wrapped(b - a)
+    return ax, ay, a, bx, by, b, turn, max(error, error_b) <= flatness
+
+
+@kernel
+def _angle_anchors(points, way, moments, first, last, limits):  # type: ignore[no-untyped-def]
+    """Places within large surfaces where the surface angle changes."""
+    arm, shortest, flatness, smallest_turn, farthest = limits
+    rows = np.empty((len(points), 4))
+    strength = np.empty(len(points))
+    found = 0
+    for s in range(len(first)):
+        begin = first[s]
+        end = begin
+        previous = found
+        for i in range(first[s] + 1, last[s]):
+            while way[i] - way[begin] > arm and i - begin > 1:
+                begin += 1
+            end = max(end, i + 1)
+            while end < last[s] and way[end] - way[i] < arm:
+                end += 1
+            if way[i] - way[begin] < shortest or way[end] - way[i] < shortest:
+                continue
+            if end - i < 2 or i - begin < 2:
+                continue
+            ax, ay, a, bx, by, b, turn, flat = _turn(points, moments, begin, i, end, flatness)
+            size = abs(turn)
+            if not flat or size < smallest_turn or size > 0.95 * math.pi:
+                continue
+            along = ((bx - ax) * math.sin(b) - (by - ay) * math.cos(b)) / math.sin(b - a)
+            x, y = ax + along * math.cos(a), ay + along * math.sin(a)
+            off = math.hypot(x - points[i, 0], y - points[i, 1])
+            if off > farthest:
+                continue
+            quality = size / smallest_turn - off / farthest
+            if (
+                found > previous
+                and math.hypot(rows[found - 1, 0] - x, rows[found - 1, 1] - y) < arm
+            ):
+                if quality <= strength[found - 1]:
+                    continue
+                found -= 1
+            rows[found, 0] = x
+            rows[found, 1] = y
+            rows[found, 2] = wrapped(a + 0.5 * turn + 0.5 * math.pi)
+            rows[found, 3] = 3.0 if turn > 0.0 else 2.0
+            strength[found] = quality
+            found += 1
+    return rows[:found]
+
+
+@kernel
+def _main_angles(surface, weights, bins, most, share):  # type: ignore[no-untyped-def]
+    """Main angles modulo 90 degrees, strongest first, each the mean direction at its peak."""
+    half = bins // 2
+    raw = np.zeros(half)
+    quarter = 0.5 * math.pi
+    for i in range(len(surface)):
+        if surface[i] == surface[i]:
+            turn = surface[i] / quarter
+            raw[min(int((turn - math.floor(turn)) * half), half - 1)] += weights[i]
+    smooth = np.empty(half)
+    for k in range(half):
+        total = 0.0
+        for j in range(-3, 4):
+            total += (4 - abs(j)) * raw[(k + j) % half]
+        smooth[k] = total
+    angles = np.empty(most)
+    found = 0
+    strongest = smooth.max() if half > 0 else 0.0
+    width = math.radians(6.0)
+    while found < most:
+        peak = np.argmax(smooth)
+        if smooth[peak] <= 0.0 or smooth[peak] < share * strongest:
+            break
+        centre = (peak + 0.5) * quarter / half
+        c, s = 0.0, 0.0
+        for i in range(len(surface)):
+            if surface[i] == surface[i]:
+                off = surface[i] - centre
+                off -= quarter * math.floor(off / quarter + 0.5)
+                if abs(off) < width:
+                    c += weights[i]
+                    s += weights[i] * off
+        angles[found] = centre + (s / c if c > 0.0 else 0.0)
+        found += 1
+        # A second main angle lies at least 15 degrees from the first.
+        reach = int(math.ceil(math.radians(15.0) / quarter * half))
+        for j in range(-reach, reach + 1):
+            smooth[(peak + j) % half] = 0.0
+    return angles[:found]
+
+
+@kernel
+def _wall_histograms(points, surface, weights, main, width, wall_angle, facing):  # type: ignore[no-untyped-def]
+    """Length of surface over x and over y of the wall frame, per side that is seen."""
+    c, s = math.cos(main), math.sin(main)
+    low, high = 0.0, 0.0
+    for i in range(len(points)):
+        x = c * points[i, 0] + s * points[i, 1]
+        y = c * points[i, 1] - s * points[i, 0]
+        low = min(low, x, y)
+        high = max(high, x, y)
+    origin = (math.floor(low / width) - 2.0) * width
+    bins = int(math.ceil((high - origin) / width)) + 3
+    histograms = np.zeros((2, 2, bins))
+    near = math.cos(wall_angle)
+    for i in range(len(points)):
+        if surface[i] != surface[i]:
+            continue
+        # The free space lies on the left of the way along the surface.
+        normal = surface[i] + 0.5 * math.pi - main
+        cn, sn = math.cos(normal), math.sin(normal)
+        if abs(cn) >= near:
+            axis, side = 0, 0 if cn > 0.0 else 1
+            u = c * points[i, 0] + s * points[i, 1]
+        elif abs(sn) >= near:
+            axis, side = 1, 0 if sn > 0.0 else 1
+            u = c * points[i, 1] - s * points[i, 0]
+        else:
+            continue
+        # Shared between the two nearest bins, so that a wall between them is one peak.
+        at = (u - origin) / width - 0.5
+        k = int(math.floor(at))
+        side = side if facing else 0
+        histograms[axis, side, k] += weights[i] * (1.0 - (at - k))
+        histograms[axis, side, k + 1] += weights[i] * (at - k)
+    return histograms, origin
+
+
+@kernel
+def _walls(histograms, limits, facing):  # type: ignore[no-untyped-def]
+    """Peaks of the histograms of one axis: rows coordinate, side, length; longest first."""
+    origin, width, smallest, most = limits
+    bins = histograms.shape[1]
+    rows = np.empty((2 * bins, 3))
+    found = 0
+    for side in range(2 if facing else 1):
+        h = histograms[side]
+        for k in range(1, bins - 1):
+            total = h[k - 1] + h[k] + h[k + 1]
+            if total < smallest or h[k] < h[k - 1] or h[k] <= h[k + 1]:
+                continue
+            shift = (h[k + 1] - h[k - 1]) / total
+            rows[found, 0] = origin + (k + 0.5 + shift) * width
+            rows[found, 1] = (1.0 - 2.0 * side) if facing else 0.0
+            rows[found, 2] = total
+            found += 1
+    order = np.argsort(-rows[:found, 2])[:most]
+    return rows[order]
+
+
+@kernel
+def _crossings(main, x_walls, y_walls):  # type: ignore[no-untyped-def]
+    """Virtual edge anchors: every x wall with every y wall."""
+    c, s = math.cos(main), math.sin(main)
+    rows = np.empty((len(x_walls) * len(y_walls), 4))
+    found = 0
+    for i in range(len(x_walls)):
+        for j in range(len(y_walls)):
+            x, y = x_walls[i, 0], y_walls[j, 0]
+            rows[found, 0] = c * x - s * y
+            rows[found, 1] = s * x + c * y
+            rows[found, 2] = wrapped(main + math.atan2(y_walls[j, 1], x_walls[i, 1]))
+            rows[found, 3] = 4.0
+            found += 1
+    return rows

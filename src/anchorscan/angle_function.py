@@ -1,0 +1,346 @@
+"""Section 2: the angle function and the angle histogram.
+
+The angle function gives the direction of the surface at every reading.  Hinkel and
+Knieriemen take two readings a constant angle apart; the paper chooses the offset per
+reading so that the two points lie at similar *metric* distance, and so do we: the pair
+of reading *i* is the first and the last reading within half a ``baseline`` of way along
+the surface on either side, and never reaches across a gap.
+
+Departures from the paper: readings are taken in counter-clockwise order and the angle
+is kept modulo 360 degrees, as the direction in which the surface is *walked* with the
+free space on the left; modulo 180 degrees it is the paper's angle.  With
+``fitted=True`` the angle is that of the line fitted to all readings between the pair
+instead of the chord, which lowers its noise at no cost (prefix sums).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field
+
+from ._jit import kernel
+from .scan import LaserScan
+
+__all__ = [
+    "AngleFunction",
+    "AngleFunctionSettings",
+    "angle_function",
+    "angle_histogram",
+    "main_angle",
+]
+
+# What lies between a return and the next one, counter-clockwise.
+CONNECTED, TO_FAR, TO_NEAR, FREE, UNKNOWN = 0, 1, 2, 3, 4
+
+
+class AngleFunctionSettings(BaseModel):
+    """Settings of section 2."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    baseline: float = Field(0.4, gt=0.0, description="metric distance of a point pair, metres")
+    fitted: bool = Field(False, description="fit a line through the readings between the pair")
+    grazing_angle: float = Field(
+        math.radians(10.0), gt=0.0, description="flattest incidence that still connects, radians"
+    )
+    noise: float = Field(0.05, ge=0.0, description="gap that noise alone can make, metres")
+    largest_gap: float = Field(0.5, gt=0.0, description="no two readings connect across more")
+    smallest_jump: float = Field(0.3, gt=0.0, description="range step that is a jump, metres")
+    bins: int = Field(180, ge=8, description="bins of the angle histogram over 180 degrees")
+
+
+@dataclass(frozen=True, eq=False)
+class AngleFunction:
+    """The returns of a scan in counter-clockwise order, with the surface at each.
+
+    Args:
+        points: (V, 2) metres, scan frame.
+        ranges: (V,) metres.
+        beams: (V,) direction of the ray, radians, ascending.
+        gaps: (V,) what lies between this return and the next: ``CONNECTED``, ``TO_FAR``,
+            ``TO_NEAR``, ``FREE`` or ``UNKNOWN``.  The last entry speaks of the first
+            return only where the scan is a full turn.
+        runs: (V,) index of the first return of the connected run that each belongs to.
+        way: (V,) way along the surface since the first return, gaps left out, metres.
+        surface: (V,) direction of the surface, radians in (-pi, pi]; NaN where a run is
+            too short to tell.
+        extents: (V,) length of surface that the return stands for, metres.
+        moments: (V + 1, 5) running sums of x, y, xx, xy, yy, from which any stretch of
+            returns has its fitted line in constant time.
+    """
+
+    points: NDArray[np.float64]
+    ranges: NDArray[np.float64]
+    beams: NDArray[np.float64]
+    gaps: NDArray[np.int64]
+    runs: NDArray[np.int64]
+    way: NDArray[np.float64]
+    surface: NDArray[np.float64]
+    extents: NDArray[np.float64]
+    moments: NDArray[np.float64]
+
+
+def angle_function(scan: LaserScan, settings: AngleFunctionSettings) -> AngleFunction:
+    """Compute the angle function of a scan (section 2).
+
+    A scan of either sense of rotation and any field of view will do; the ends of a full
+    turn are neighbours, and a second look at the same direction is dropped.
+    """
+    points, ranges, beams, indices, count = _returns(
+        scan.ranges, scan.angle_min, scan.angle_increment, scan.range_min, scan.range_max
+    )
+    gaps = _gaps(
+        points,
+        ranges,
+        beams,
+        indices,
+        _free_before(scan.ranges, scan.range_max, scan.angle_increment, count),
+        count if scan.is_full_turn else 0,
+        abs(scan.angle_increment),
+        (
+            settings.grazing_angle,
+            settings.noise,
+            settings.largest_gap,
+            settings.smallest_jump,
+        ),
+    )
+    if scan.is_full_turn and len(beams):
+        points, ranges, beams, gaps = _begin_at_gap(points, ranges, beams, gaps)
+    runs, way, extents, moments = _runs(points, gaps)
+    surface = _surface(points, runs, way, moments, settings.baseline, settings.fitted)
+    return AngleFunction(points, ranges, beams, gaps, runs, way, surface, extents, moments)
+
+
+def angle_histogram(angles: AngleFunction, settings: AngleFunctionSettings) -> NDArray[np.float64]:
+    """Return the (bins,) angle histogram over [0, pi), smoothed by 1-2-1 (section 2).
+
+    Every reading weighs as the length of surface that it stands for, not as one: so a
+    wall counts by its size and not by its closeness to the sensor.
+    """
+    return _histogram(angles.surface, angles.extents, settings.bins)
+
+
+def main_angle(histogram: NDArray[np.float64]) -> float:
+    """Return the direction of the highest peak of an angle histogram, radians in [0, pi).
+
+    The peak is refined by the parabola through its three bins; NaN without any weight.
+    """
+    count = len(histogram)
+    peak = int(np.argmax(histogram))
+    if histogram[peak] <= 0.0:
+        return math.nan
+    before, here, after = (float(histogram[(peak + k) % count]) for k in (-1, 0, 1))
+    curvature = before - 2.0 * here + after
+    shift = 0.5 * (before - after) / curvature if curvature < 0.0 else 0.0
+    return ((peak + 0.5 + shift) * math.pi / count) % math.pi
+
+
+@kernel
+def _returns(ranges, angle_min, increment, range_min, range_max):  # type: ignore[no-untyped-def]
+    """End points, ranges, directions and sweep positions of the returns, counter-clockwise."""
+    step = abs(increment)
+    count = len(ranges)
+    if count > 1:
+        count = min(count, int(math.floor(2.0 * math.pi / step + 0.5)))
+    points = np.empty((count, 2))
+    out = np.empty(count)
+    beams = np.empty(count)
+    indices = np.empty(count, np.int64)
+    first = angle_min if increment > 0.0 else angle_min + increment * (count - 1)
+    used = 0
+    for k in range(count):
+        r = np.float64(ranges[k if increment > 0.0 else count - 1 - k])
+        if r >= range_min and r <= range_max and r > 0.0 and r < np.inf:
+            beam = first + k * step
+            points[used, 0] = r * math.cos(beam)
+            points[used, 1] = r * math.sin(beam)
+            out[used] = r
+            beams[used] = beam
+            indices[used] = k
+            used += 1
+    return points[:used], out[:used], beams[:used], indices[:used], count
+
+
+@kernel
+def _free_before(ranges, range_max, increment, count):  # type: ignore[no-untyped-def]
+    """(count + 1,) number of free readings before each sweep position."""
+    free = np.zeros(count + 1, np.int64)
+    for k in range(count):
+        r = ranges[k if increment > 0.0 else count - 1 - k]
+        free[k + 1] = free[k] + (1 if r > range_max else 0)
+    return free
+
+
+@kernel
+def _gap(near, far, angle, limits):  # type: ignore[no-untyped-def]
+    """Tell whether two returns, ``angle`` apart, may lie on one surface."""
+    grazing, noise, largest, _ = limits
+    apart = math.sqrt(near * near + far * far - 2.0 * near * far * math.cos(angle))
+    reach = near * math.sin(angle) / math.sin(grazing - angle) if angle < grazing else largest
+    return apart > min(reach + noise, max(largest, 2.0 * noise))
+
+
+@kernel
+def _gaps(points, ranges, beams, indices, free, turn, step, limits):  # type: ignore[no-untyped-def]
+    """What lies between each return and the next; ``turn`` is the sweep's length if closed."""
+    count = len(ranges)
+    gaps = np.full(count, UNKNOWN, np.int64)
+    most_missing = 3
+    for i in range(count):
+        j = i + 1
+        if j == count:
+            if turn == 0 or count < 2:
+                break
+            j = 0
+        between = indices[j] - indices[i]
+        seen_free = free[indices[j]] - free[indices[i] + 1]
+        if j == 0:
+            between += turn
+            seen_free = free[len(free) - 1] - free[indices[i] + 1] + free[indices[0]]
+        missing = between - 1 - seen_free
+        if seen_free > 0:
+            gaps[i] = FREE if missing <= most_missing else UNKNOWN
+            continue
+        if missing > most_missing:
+            continue
+        near = min(ranges[i], ranges[j])
+        far = max(ranges[i], ranges[j])
+        if not _gap(near, far, between * step, limits):
+            gaps[i] = CONNECTED
+        elif far - near >= limits[3]:
+            gaps[i] = TO_FAR if ranges[j] > ranges[i] else TO_NEAR
+    return gaps
+
+
+@kernel
+def _begin_at_gap(points, ranges, beams, gaps):  # type: ignore[no-untyped-def]
+    """Turn a closed sweep so that it begins behind a gap, or else on a straight stretch."""
+    count = len(ranges)
+    begin = -1
+    for i in range(count):
+        if gaps[i] != CONNECTED:
+            begin = (i + 1) % count
+            break
+    if begin < 0:
+        begin = 0
+        straightest = np.inf
+        offset = max(1, count // 90)
+        for i in range(count):
+            a = points[(i - offset) % count]
+            b = points[(i + offset) % count]
+            bend = math.hypot(a[0] + b[0] - 2.0 * points[i, 0], a[1] + b[1] - 2.0 * points[i, 1])
+            if bend < straightest:
+                straightest = bend
+                begin = i
+    order = (np.arange(count) + begin) % count
+    turned = beams[order]
+    for i in range(count - begin, count):
+        turned[i] += 2.0 * math.pi
+    return points[order], ranges[order], turned, gaps[order]
+
+
+@kernel
+def _runs(points, gaps):  # type: ignore[no-untyped-def]
+    """Connected runs, way along them, surface length per return, and running moments."""
+    count = len(points)
+    runs = np.zeros(count, np.int64)
+    way = np.zeros(count)
+    extents = np.zeros(count)
+    moments = np.zeros((count + 1, 5))
+    for i in range(count):
+        x, y = points[i, 0], points[i, 1]
+        moments[i + 1, 0] = moments[i, 0] + x
+        moments[i + 1, 1] = moments[i, 1] + y
+        moments[i + 1, 2] = moments[i, 2] + x * x
+        moments[i + 1, 3] = moments[i, 3] + x * y
+        moments[i + 1, 4] = moments[i, 4] + y * y
+        if i == 0:
+            continue
+        runs[i] = i
+        way[i] = way[i - 1]
+        if gaps[i - 1] == CONNECTED:
+            step = math.hypot(x - points[i - 1, 0], y - points[i - 1, 1])
+            runs[i] = runs[i - 1]
+            way[i] += step
+            extents[i - 1] += 0.5 * step
+            extents[i] += 0.5 * step
+    return runs, way, extents, moments
+
+
+@kernel
+def line_through(moments, first, last):  # type: ignore[no-untyped-def]
+    """Total least squares line of returns ``first`` to ``last``: centre, direction, rms error.
+
+    The direction is modulo 180 degrees; the caller chooses its sense.
+    """
+    n = last - first + 1.0
+    cx = (moments[last + 1, 0] - moments[first, 0]) / n
+    cy = (moments[last + 1, 1] - moments[first, 1]) / n
+    xx = (moments[last + 1, 2] - moments[first, 2]) / n - cx * cx
+    xy = (moments[last + 1, 3] - moments[first, 3]) / n - cx * cy
+    yy = (moments[last + 1, 4] - moments[first, 4]) / n - cy * cy
+    direction = 0.5 * math.atan2(2.0 * xy, xx - yy)
+    spread = math.sqrt((xx - yy) * (xx - yy) + 4.0 * xy * xy)
+    return cx, cy, direction, math.sqrt(max(0.5 * (xx + yy - spread), 0.0))
+
+
+@kernel
+def wrapped(angle):  # type: ignore[no-untyped-def]
+    """Wrap an angle into [-pi, pi)."""
+    return angle - 2.0 * math.pi * math.floor((angle + math.pi) / (2.0 * math.pi))
+
+
+@kernel
+def walked(direction, dx, dy):  # type: ignore[no-untyped-def]
+    """Give a line's direction the sense of the way (dx, dy) along it."""
+    if math.cos(direction) * dx + math.sin(direction) * dy < 0.0:
+        direction += math.pi
+    return wrapped(direction)
+
+
+@kernel
+def _surface(points, runs, way, moments, baseline, fitted):  # type: ignore[no-untyped-def]
+    """Direction of the surface at every return over a near-constant metric baseline."""
+    count = len(points)
+    surface = np.full(count, np.nan)
+    first = 0
+    last = 0
+    for i in range(count):
+        first = max(first, runs[i])
+        while way[i] - way[first] > 0.5 * baseline and first < i:
+            first += 1
+        # One more than half a baseline away, where the run goes on: pairs are never too short.
+        begin = first - 1 if first > runs[i] else first
+        last = max(last, i)
+        while (
+            last + 1 < count and runs[last + 1] == runs[i] and (way[last] - way[i] < 0.5 * baseline)
+        ):
+            last += 1
+        dx = points[last, 0] - points[begin, 0]
+        dy = points[last, 1] - points[begin, 1]
+        if dx * dx + dy * dy < 0.0625 * baseline * baseline:
+            continue
+        if fitted and last - begin >= 2:
+            direction = line_through(moments, begin, last)[2]
+            surface[i] = walked(direction, dx, dy)
+        else:
+            surface[i] = math.atan2(dy, dx)
+    return surface
+
+
+@kernel
+def _histogram(surface, weights, bins):  # type: ignore[no-untyped-def]
+    """Weighted histogram of directions modulo pi, smoothed by 1-2-1."""
+    raw = np.zeros(bins)
+    for i in range(len(surface)):
+        if surface[i] == surface[i]:
+            turn = surface[i] / math.pi
+            raw[min(int((turn - math.floor(turn)) * bins), bins - 1)] += weights[i]
+    smooth = np.empty(bins)
+    for k in range(bins):
+        smooth[k] = 0.25 * raw[k - 1] + 0.5 * raw[k] + 0.25 * raw[(k + 1) % bins]
+    return smooth
