@@ -33,7 +33,6 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from ._jit import kernel
 from .angle_function import (
-    CONNECTED,
     FREE,
     TO_FAR,
     TO_NEAR,
@@ -241,7 +240,6 @@ def virtual_edges(angles: AngleFunction, settings: AnchorSettings) -> list[Virtu
 def _jump_edges(points, gaps, way, moments, first, last, limits):  # type: ignore[no-untyped-def]
     """Margins of large surfaces behind which the range jumps to far."""
     arm, shortest, flatness, rim = limits
-    count = len(points)
     rows = np.empty((2 * len(first), 4))
     found = 0
     for s in range(len(first)):
@@ -250,7 +248,7 @@ def _jump_edges(points, gaps, way, moments, first, last, limits):  # type: ignor
             at = b if side == 0 else a
             gap = gaps[b] if side == 0 else gaps[a - 1]
             near = TO_FAR if side == 0 else TO_NEAR
-            if gap != near and gap != FREE:
+            if gap not in (near, FREE):
                 continue
             other = at
             while other != (a if side == 0 else b) and abs(way[other] - way[at]) < arm:
