@@ -28,14 +28,18 @@ _HOMES = {
     "AnchorscanError": "errors",
     "Hypothesis": "hypothesis",
     "LaserScan": "scan",
+    "Log": "io",
     "LogError": "errors",
     "MissingExtraError": "errors",
     "Pose2D": "pose",
+    "Problem": "io",
     "Record": "record",
     "Reference": "reference",
     "ReferenceSetError": "errors",
     "ScanError": "errors",
     "SettingsError": "errors",
+    "open_log": "io",
+    "write_tum": "io",
 }
 
 __all__ = sorted([*_HOMES, "__version__"])  # noqa: PLE0605 - the list is one with _HOMES

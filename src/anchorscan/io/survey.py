@@ -1,0 +1,120 @@
+"""One look through a whole log: which of its columns say anything.
+
+A log has the same columns whether anybody filled them in or not:
+
+* poses that are zero in every one of several records, or that stand still while the other
+  column or the scans show motion, were never filled in: the log has none;
+* odometry that equals the pose in every record is one trajectory written twice, as in
+  corrected logs: the log has the pose and no odometry;
+* a time that is zero in every record is no time.
+"""
+
+from __future__ import annotations
+
+import math
+from statistics import median
+
+from ..pose import Pose2D
+from .scan_line import ScanLine
+
+__all__ = ["Survey"]
+
+# How much must change before a column that stands still is disbelieved.
+_MOVED_DISTANCE = 0.5
+_MOVED_ANGLE = math.radians(30.0)
+_CHANGED_RANGE = 0.25
+# Poses that differ by less than the printed digits are one, metres and radians.
+_SAME = 2e-3
+
+
+class Survey:
+    """What the columns of a log hold, gathered line by line."""
+
+    def __init__(self) -> None:
+        self._poses = _Column()
+        self._odometry = _Column()
+        self._is_one_trajectory = True
+        self._first: ScanLine | None = None
+        self._change = 0.0
+        self._has_stamps = False
+
+    def add(self, line: ScanLine, mounting: Pose2D) -> None:
+        """Count one scan line.
+
+        Args:
+            line: The line.
+            mounting: ``T_base_laser`` of its laser, as far as the log tells.
+        """
+        self._poses.add(line.laser)
+        self._odometry.add(line.robot)
+        self._has_stamps = self._has_stamps or bool(line.stamp)
+        if self._is_one_trajectory and line.laser is not None and line.robot is not None:
+            self._is_one_trajectory = _is_same(line.laser, line.robot) or _is_same(
+                line.laser, line.robot @ mounting
+            )
+        if not (self._poses.moves and self._odometry.moves):
+            self._compare(line)
+
+    @property
+    def has_poses(self) -> bool:
+        """Whether the pose column was filled in."""
+        return self._poses.is_filled(motion_seen=self._odometry.is_drive or self._scans_change)
+
+    @property
+    def has_odometry(self) -> bool:
+        """Whether the odometry column was filled in, with something else than the poses."""
+        return not self._is_one_trajectory and self._odometry.is_filled(
+            motion_seen=self._poses.is_drive or self._scans_change
+        )
+
+    @property
+    def has_stamps(self) -> bool:
+        """Whether the time column was filled in."""
+        return self._has_stamps
+
+    @property
+    def _scans_change(self) -> bool:
+        return self._change > _CHANGED_RANGE
+
+    def _compare(self, line: ScanLine) -> None:
+        """Keep how far the readings of a laser that claims to stand still have changed."""
+        if self._first is None or len(self._first.ranges) != len(line.ranges):
+            self._first = line
+        elif not self._scans_change:
+            try:
+                pairs = zip(map(float, self._first.ranges), map(float, line.ranges), strict=True)
+                steps = [abs(a - b) for a, b in pairs if math.isfinite(a - b)]
+            except ValueError:
+                return
+            # People walking past change some readings; driving changes most of them.
+            self._change = median(steps) if steps else 0.0
+
+
+class _Column:
+    """One pose column."""
+
+    def __init__(self) -> None:
+        self.moves = False
+        self.is_drive = False
+        self._first: Pose2D | None = None
+        self._count = 0
+
+    def add(self, pose: Pose2D | None) -> None:
+        if pose is None:
+            return
+        self._count += 1
+        if self._first is None:
+            self._first = pose
+        elif not self.is_drive:
+            self.moves = self.moves or pose != self._first
+            distance, turn = pose.distance(self._first), pose.turn(self._first)
+            self.is_drive = distance > _MOVED_DISTANCE or turn > _MOVED_ANGLE
+
+    def is_filled(self, *, motion_seen: bool) -> bool:
+        if self._first == Pose2D() and not self.moves and self._count > 1:
+            return False
+        return self._count > 0 and (self.moves or not motion_seen)
+
+
+def _is_same(a: Pose2D, b: Pose2D) -> bool:
+    return a.distance(b) < _SAME and a.turn(b) < _SAME
