@@ -16,10 +16,16 @@ if TYPE_CHECKING:  # what type checkers and editors see; a test holds it equal t
     from .errors import ScanError as ScanError
     from .errors import SettingsError as SettingsError
     from .hypothesis import Hypothesis as Hypothesis
+    from .occupancy import OccupancyGrid as OccupancyGrid
     from .pose import Pose2D as Pose2D
     from .record import Record as Record
     from .reference import Reference as Reference
     from .scan import LaserScan as LaserScan
+    from .sensor import SensorModel as SensorModel
+    from .simulator import World as World
+    from .simulator import drive as drive
+    from .simulator import random_building as random_building
+    from .simulator import simulate as simulate
 
 __version__ = "0.1.0"
 
@@ -31,14 +37,20 @@ _HOMES = {
     "Log": "io",
     "LogError": "errors",
     "MissingExtraError": "errors",
+    "OccupancyGrid": "occupancy",
     "Pose2D": "pose",
     "Problem": "io",
     "Record": "record",
     "Reference": "reference",
     "ReferenceSetError": "errors",
     "ScanError": "errors",
+    "SensorModel": "sensor",
     "SettingsError": "errors",
+    "World": "simulator",
+    "drive": "simulator",
     "open_log": "io",
+    "random_building": "simulator",
+    "simulate": "simulator",
     "write_tum": "io",
 }
 
