@@ -22,6 +22,8 @@ class Record:
         stamp: Seconds, on the log's own clock, where known.
         source: File and line (or topic and message) that it came from, for messages.
         problem: Why ``scan`` is None.
+        T_base_laser: Where the laser sits on the robot, where the log tells; with it
+            ``T_map_base = pose @ T_base_laser.inverse()``.
     """
 
     index: int
@@ -31,3 +33,4 @@ class Record:
     stamp: float | None = None
     source: str = ""
     problem: str = ""
+    T_base_laser: Pose2D | None = None

@@ -1,9 +1,9 @@
 """CARMEN logs: ``FLASER``, ``RLASER`` and ``ROBOTLASER1`` lines among others.
 
-**Geometry.**  ``ROBOTLASER1`` carries its own.  ``FLASER`` has none: it follows from
-``PARAM laser_front_laser_resolution`` or else from the number of readings, where that number
-means one sensor.  Any other number is a problem that asks for ``field_of_view``, because a
-wrong guess would give a wrong pose.
+**Geometry.**  ``ROBOTLASER1`` carries its own.  ``FLASER`` has none: it follows from the
+number of readings, where that number means one sensor, and from ``PARAM
+laser_front_laser_resolution`` (``.._fov``) otherwise.  Any other number is a problem that asks
+for ``field_of_view``, because a wrong guess would give a wrong pose.
 
 **Limit.**  80 m unless the log says less (``max_range``, ``PARAM robot_front_laser_max``) or
 the caller says otherwise.
@@ -11,28 +11,27 @@ the caller says otherwise.
 **Poses.**  ``x y theta`` is the corrected pose of the **laser**.  ``odom_x odom_y odom_theta``
 is the pose of the **robot** by odometry, as CARMEN's logger writes it; it is carried to the
 laser by ``PARAM robot_frontlaser_offset``, ``.._side_offset`` and ``.._angular_offset`` (a rear
-laser looks backwards unless they say otherwise).  Where a log has no such lines, both are taken
-to be the laser's.  Logs of published benchmarks whose odometry is the laser's have none.
+laser looks backwards unless they say otherwise).  In a log without such lines it is taken to be
+the laser's, which is what logs without a header hold.
 
 A **raw** log, in which ``x y theta`` is uncorrected odometry too, looks exactly like a corrected
-one; ``pose_columns="odometry"`` says that it is one.  What else the columns may lack is told
-in `survey`.
+one; ``pose_columns="odometry"`` says that it is one.  How columns that nobody filled in are
+noticed is told in `survey`.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from dataclasses import replace
+from functools import partial
 from typing import Literal
 
-from ..errors import LogError, ScanError
 from ..pose import Pose2D
-from ..record import Record
-from ..scan import LaserScan
-from .geometry import RANGE_MAX, geometry_of
-from .log import Log, Report
+from .geometry import RANGE_MAX, ScanGeometry, geometry_of
+from .line_log import LineLog
+from .log import Report
 from .scan_line import SCAN_KINDS, BadLine, ScanLine, parse_laser, parse_robot_laser
-from .survey import Survey
 from .text import TextFile, shown
 
 __all__ = ["KINDS", "CarmenLog", "PoseColumns"]
@@ -48,8 +47,11 @@ _OTHER_KINDS = frozenset(
 KINDS = SCAN_KINDS | _OTHER_KINDS
 """First words of the lines of CARMEN logs."""
 
+_FULL_TURN = 2.0 * math.pi
+_WHOLE = 0.01
 
-class CarmenLog(Log):
+
+class CarmenLog(LineLog):
     """A CARMEN log.
 
     Args:
@@ -74,83 +76,18 @@ class CarmenLog(Log):
         range_max: float | None = None,
         pose_columns: PoseColumns = "corrected",
     ) -> None:
-        super().__init__(text.path)
-        self._text = text
         self._field_of_view = field_of_view
-        self._range_max = range_max
-        self._pose_columns = pose_columns
-        self._survey, self.count = self._look_through()
+        super().__init__(text, range_max=range_max, has_corrected_poses=pose_columns == "corrected")
 
-    def _look_through(self) -> tuple[Survey, int]:
-        survey, parameters = Survey(), _Parameters()
-        count, usable = 0, False
-        complaints: list[tuple[int, str]] = []
-
-        def complain(number: int, reason: str) -> None:
-            del complaints[1:]
-            complaints.append((number, reason))
-
-        for line in self._scan_lines(complain, parameters):
-            count += 1
-            if isinstance(line, ScanLine):
-                survey.add(line, parameters.mounting(line.kind))
-                usable = usable or self._scan(line, parameters, complain) is not None
-        if usable:
-            return survey, count
-        if complaints:
-            number, reason = complaints[0]
-            raise LogError(f"no readable laser scan: {reason}", self.path, number)
-        raise LogError("no laser scan in it (FLASER, RLASER or ROBOTLASER1 line)", self.path)
-
-    def _read(self, report: Report) -> Iterator[Record]:
-        has_poses, has_odometry = self._survey.has_poses, self._survey.has_odometry
-        has_stamps = self._survey.has_stamps
+    def _scan_lines(self, report: Report) -> Iterator[ScanLine | BadLine]:
         parameters = _Parameters()
-        for index, line in enumerate(self._scan_lines(report, parameters)):
-            source = f"{self.path}:{line.number}"
-            if isinstance(line, BadLine):
-                yield Record(index, None, source=source, problem=line.reason)
-                continue
-            reasons: list[str] = []
-            scan = self._scan(line, parameters, lambda _, reason: reasons.append(reason))  # noqa: B023
-            if has_poses and line.laser is None:
-                reasons.append("the pose is not finite")
-            for reason in reasons:
-                report(line.number, reason)
-            pose = line.laser if has_poses else None
-            odometry = None
-            if self._pose_columns == "odometry":
-                pose, odometry = None, pose
-            elif has_odometry and line.robot is not None:
-                odometry = line.robot @ parameters.mounting(line.kind)
-            yield Record(
-                index,
-                scan,
-                pose,
-                odometry,
-                line.stamp if has_stamps else None,
-                source,
-                reasons[0] if scan is None else "",
-            )
-
-    def _scan_lines(self, report: Report, parameters: _Parameters) -> Iterator[ScanLine | BadLine]:
         unknown: set[bytes] = set()
-        tail_length: int | None = None
         for number, line in self._text.lines(report):
             kind = line.split(maxsplit=1)[0]
-            if kind == b"PARAM":
+            if kind in SCAN_KINDS:
+                yield self._parse(number, kind, line, parameters)
+            elif kind == b"PARAM":
                 parameters.add(line)
-            elif kind in SCAN_KINDS:
-                try:
-                    if kind == b"ROBOTLASER1":
-                        yield parse_robot_laser(number, line)
-                        continue
-                    parsed = parse_laser(number, line, tail_length)
-                    tail_length = parsed.tail_length
-                    yield parsed
-                except ValueError as error:
-                    report(number, str(error))
-                    yield BadLine(number, str(error))
             elif kind not in _OTHER_KINDS and not kind.startswith(b"#") and kind not in unknown:
                 if _is_kind(kind):
                     unknown.add(kind)
@@ -158,21 +95,16 @@ class CarmenLog(Log):
                 else:
                     report(number, f"not a line of a CARMEN log: {shown(line)}")
 
-    def _scan(self, line: ScanLine, parameters: _Parameters, report: Report) -> LaserScan | None:
+    def _parse(
+        self, number: int, kind: bytes, line: bytes, parameters: _Parameters
+    ) -> ScanLine | BadLine:
         try:
-            geometry = line.geometry
-            if geometry is None or self._field_of_view is not None:
-                said = geometry.range_max if geometry else parameters.range_max(line.kind)
-                geometry = geometry_of(
-                    len(line.ranges),
-                    field_of_view=self._field_of_view,
-                    resolution=parameters.resolution(line.kind),
-                    range_max=said,
-                )
-            return line.scan(geometry, self._range_max)
-        except (ValueError, ScanError) as error:
-            report(line.number, str(error))
-            return None
+            if kind == b"ROBOTLASER1":
+                return parse_robot_laser(number, line, self._field_of_view)
+            geometry = partial(parameters.geometry, kind, self._field_of_view)
+            return replace(parse_laser(number, line, geometry), mounting=parameters.mounting(kind))
+        except ValueError as error:
+            return BadLine(number, str(error))
 
 
 class _Parameters:
@@ -191,21 +123,35 @@ class _Parameters:
             if math.isfinite(value):
                 self._values[words[1]] = value
 
-    def resolution(self, kind: bytes) -> float | None:
-        """Angle between readings, radians."""
-        value = self._values.get(b"laser_%b_laser_resolution" % _side(kind), 0.0)
-        return math.radians(value) if value > 0.0 else None
+    def geometry(self, kind: bytes, field_of_view: float | None, count: int) -> ScanGeometry:
+        """Return the geometry of ``count`` readings of the laser behind a kind of line.
 
-    def range_max(self, kind: bytes) -> float:
-        """From this range on a reading is no return, metres."""
-        value = self._values.get(b"robot_%b_laser_max" % _side(kind), RANGE_MAX)
-        return value if 0.0 < value < RANGE_MAX else RANGE_MAX
+        Raises:
+            ValueError: Nothing is known and the number does not tell.
+        """
+        name = b"laser_%b_laser" % _side(kind)
+        resolution = math.radians(self._values.get(name + b"_resolution", 0.0))
+        covered = self._values.get(name + b"_fov", 0.0)
+        if covered > _FULL_TURN + _WHOLE:
+            covered = math.radians(covered)
+        limit = self._values.get(b"robot_%b_laser_max" % _side(kind), RANGE_MAX)
+        return geometry_of(
+            count,
+            field_of_view=field_of_view,
+            resolution=resolution if resolution > 0.0 else None,
+            # Both together are trusted more than what the number suggests, one alone less.
+            is_certain=resolution > 0.0
+            and min(abs(covered / resolution - steps) for steps in (count, count - 1)) < 1.0,
+            range_max=limit if 0.0 < limit < RANGE_MAX else RANGE_MAX,
+        )
 
-    def mounting(self, kind: bytes) -> Pose2D:
-        """``T_base_laser``; the identity (turned around for a rear laser) where not told."""
+    def mounting(self, kind: bytes) -> Pose2D | None:
+        """Return ``T_base_laser``, or None where the log does not tell."""
         name = b"robot_%blaser" % _side(kind)
+        if name + b"_offset" not in self._values:
+            return None
         return Pose2D(
-            self._values.get(name + b"_offset", 0.0),
+            self._values[name + b"_offset"],
             self._values.get(name + b"_side_offset", 0.0),
             self._values.get(name + b"_angular_offset", math.pi if kind == b"RLASER" else 0.0),
         )

@@ -1,8 +1,8 @@
 """g2o files: the ``ROBOTLASER1`` line that follows a ``VERTEX_SE2`` is the scan taken there.
 
 The vertex is the optimised pose of the **robot**; the two poses of the scan line tell where
-the laser sits on it: ``T_map_laser = T_map_robot @ inverse(T_odom_robot) @ T_odom_laser``.
-``T_odom_laser`` is the odometry where it is another trajectory than the vertices'.
+the laser sits on it: ``T_map_laser = T_map_base @ inverse(T_odom_base) @ T_odom_laser``.
+The scan line's poses are the odometry where they are another trajectory than the vertices'.
 Edges and parameters are not needed and not looked at.
 """
 
@@ -11,14 +11,10 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 
-from ..errors import LogError, ScanError
 from ..pose import Pose2D
-from ..record import Record
-from ..scan import LaserScan
-from .geometry import geometry_of
-from .log import Log, Report
+from .line_log import LineLog
+from .log import Report
 from .scan_line import BadLine, ScanLine, parse_robot_laser
-from .survey import Survey
 from .text import TextFile, shown
 
 __all__ = ["KINDS", "G2oLog"]
@@ -29,7 +25,7 @@ KINDS = frozenset({b"VERTEX_SE2", b"EDGE_SE2", b"FIX"})
 _VERTEX_WORDS = 5
 
 
-class G2oLog(Log):
+class G2oLog(LineLog):
     """A g2o file with laser scans.
 
     Args:
@@ -50,60 +46,10 @@ class G2oLog(Log):
         field_of_view: float | None = None,
         range_max: float | None = None,
     ) -> None:
-        super().__init__(text.path)
-        self._text = text
         self._field_of_view = field_of_view
-        self._range_max = range_max
-        self._survey, self.count = self._look_through()
+        super().__init__(text, range_max=range_max)
 
-    def _look_through(self) -> tuple[Survey, int]:
-        survey = Survey()
-        count, usable = 0, False
-        complaints: list[tuple[int, str]] = []
-
-        def complain(number: int, reason: str) -> None:
-            del complaints[1:]
-            complaints.append((number, reason))
-
-        for vertex, line in self._scan_lines(complain):
-            count += 1
-            if isinstance(line, ScanLine):
-                poses = replace(line, laser=_laser_pose(vertex, line), robot=line.laser)
-                survey.add(poses, Pose2D())
-                usable = usable or self._scan(line, complain) is not None
-        if usable:
-            return survey, count
-        if complaints:
-            number, reason = complaints[0]
-            raise LogError(f"no readable laser scan: {reason}", self.path, number)
-        raise LogError("a pose graph without laser scans (ROBOTLASER1 lines)", self.path)
-
-    def _read(self, report: Report) -> Iterator[Record]:
-        survey = self._survey
-        has_poses, has_odometry = survey.has_poses, survey.has_odometry
-        for index, (vertex, line) in enumerate(self._scan_lines(report)):
-            source = f"{self.path}:{line.number}"
-            if isinstance(line, BadLine):
-                yield Record(index, None, source=source, problem=line.reason)
-                continue
-            reasons: list[str] = []
-            scan = self._scan(line, lambda _, reason: reasons.append(reason))  # noqa: B023
-            pose = _laser_pose(vertex, line)
-            if has_poses and pose is None:
-                reasons.append("the scan has no pose (no VERTEX_SE2 before it, or not finite)")
-            for reason in reasons:
-                report(line.number, reason)
-            yield Record(
-                index,
-                scan,
-                pose if has_poses else None,
-                line.laser if has_odometry else None,
-                line.stamp if survey.has_stamps else None,
-                source,
-                reasons[0] if scan is None else "",
-            )
-
-    def _scan_lines(self, report: Report) -> Iterator[tuple[Pose2D | None, ScanLine | BadLine]]:
+    def _scan_lines(self, report: Report) -> Iterator[ScanLine | BadLine]:
         vertex: Pose2D | None = None
         for number, line in self._text.lines(report):
             kind = line.split(maxsplit=1)[0]
@@ -113,22 +59,12 @@ class G2oLog(Log):
                     report(number, f"not a vertex: {shown(line)}")
             elif kind == b"ROBOTLASER1":
                 try:
-                    yield vertex, parse_robot_laser(number, line)
+                    parsed = parse_robot_laser(number, line, self._field_of_view)
+                    yield _placed(parsed, vertex)
                 except ValueError as error:
-                    report(number, str(error))
-                    yield vertex, BadLine(number, str(error))
+                    yield BadLine(number, str(error))
             elif not (kind.startswith(b"#") or (kind[:1].isalpha() and kind.isupper())):
                 report(number, f"not a line of a g2o file: {shown(line)}")
-
-    def _scan(self, line: ScanLine, report: Report) -> LaserScan | None:
-        try:
-            geometry = line.geometry
-            if geometry is None or self._field_of_view is not None:
-                geometry = geometry_of(len(line.ranges), field_of_view=self._field_of_view)
-            return line.scan(geometry, self._range_max)
-        except (ValueError, ScanError) as error:
-            report(line.number, str(error))
-            return None
 
 
 def _vertex(line: bytes) -> Pose2D | None:
@@ -142,11 +78,12 @@ def _vertex(line: bytes) -> Pose2D | None:
     return pose if pose.is_finite() else None
 
 
-def _laser_pose(vertex: Pose2D | None, line: ScanLine) -> Pose2D | None:
-    if vertex is None:
-        return None
-    if line.laser is None or line.robot is None:
-        return None
+def _placed(line: ScanLine, vertex: Pose2D | None) -> ScanLine:
+    """Return the line with the pose that the vertex gives its laser."""
+    if vertex is None or line.laser is None or line.robot is None:
+        return replace(line, laser=None)
+    # Not by way of the inverse where it can be avoided: the vertex keeps its last digit.
     if line.laser == line.robot:
-        return vertex
-    return vertex @ line.robot.inverse() @ line.laser
+        return replace(line, laser=vertex, mounting=Pose2D())
+    mounting = line.robot.inverse() @ line.laser
+    return replace(line, laser=vertex @ mounting, mounting=mounting)

@@ -63,6 +63,7 @@ def geometry_of(
     *,
     field_of_view: float | None = None,
     resolution: float | None = None,
+    is_certain: bool = False,
     range_max: float = RANGE_MAX,
 ) -> ScanGeometry:
     """Return the geometry of ``count`` readings.
@@ -70,8 +71,8 @@ def geometry_of(
     Args:
         count: Number of readings.
         field_of_view: Angle that they cover, radians, where it is known.
-        resolution: Angle between readings, radians, where it is known; yields to
-            ``field_of_view``.
+        resolution: Angle between readings, radians, where somebody told it.
+        is_certain: Whether ``resolution`` stands above what the number suggests.
         range_max: From this range on a reading is no return, metres.
 
     Raises:
@@ -79,13 +80,13 @@ def geometry_of(
     """
     if field_of_view is not None:
         return ScanGeometry(*spread(field_of_view, count), range_max=range_max)
-    if resolution is None or not 0.0 < resolution * (count - 1) < _FULL_TURN:
-        known = _RESOLUTIONS.get(count if count % 2 else count + 1)
-        if known is None:
-            raise ValueError(
-                f"the field of view of {count} readings is not known; give it (field_of_view)"
-            )
+    known = _RESOLUTIONS.get(count if count % 2 else count + 1)
+    if known is not None and not is_certain:
         resolution = math.radians(known)
+    if resolution is None or not 0.0 < resolution * (count - 1) < _FULL_TURN:
+        raise ValueError(
+            f"the field of view of {count} readings is not known; give it (field_of_view)"
+        )
     steps = count if count % 2 == 0 else count - 1
     return ScanGeometry(-0.5 * steps * resolution, resolution, range_max=range_max)
 

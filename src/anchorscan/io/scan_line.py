@@ -14,14 +14,14 @@ so that a reading is never taken for a pose.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from ..pose import Pose2D
 from ..scan import LaserScan
-from .geometry import ScanGeometry, make_scan
+from .geometry import ScanGeometry, geometry_of, make_scan
 from .text import shown
 
 __all__ = ["SCAN_KINDS", "BadLine", "ScanLine", "parse_laser", "parse_robot_laser"]
@@ -44,11 +44,12 @@ class ScanLine:
         number: Its number in the file, from one.
         kind: First word of the line.
         ranges: (N,) words.
-        laser: The first pose column, None where it is not finite.
-        robot: The second pose column, None where it is not finite.
+        laser: ``T_map_laser``, None where it is not finite.
+        robot: ``T_odom_base``, None where it is not finite.
         stamp: Seconds, where the line has them.
-        geometry: Where the readings look, if the line says so.
+        geometry: Where the readings look.
         tail_length: Number of words behind the readings.
+        mounting: ``T_base_laser``, where the log tells.
     """
 
     number: int
@@ -57,14 +58,14 @@ class ScanLine:
     laser: Pose2D | None
     robot: Pose2D | None
     stamp: float | None
-    geometry: ScanGeometry | None
+    geometry: ScanGeometry
     tail_length: int
+    mounting: Pose2D | None = None
 
-    def scan(self, geometry: ScanGeometry, range_max: float | None = None) -> LaserScan:
+    def scan(self, range_max: float | None = None) -> LaserScan:
         """Make the scan.
 
         Args:
-            geometry: Where the readings look.
             range_max: The sensor's limit instead of the geometry's, metres.
 
         Raises:
@@ -73,8 +74,8 @@ class ScanLine:
         """
         if not self.ranges:
             raise ValueError("the scan has no readings")
-        values = _numbers(self.ranges, "a range")
-        return make_scan(np.array(values), geometry, range_max=range_max)
+        values = np.array(_numbers(self.ranges, "a range"))
+        return make_scan(values, self.geometry, range_max=range_max)
 
 
 @dataclass(frozen=True)
@@ -90,14 +91,13 @@ class BadLine:
     reason: str
 
 
-def parse_laser(number: int, line: bytes, tail_length: int | None = None) -> ScanLine:
+def parse_laser(number: int, line: bytes, geometry: Callable[[int], ScanGeometry]) -> ScanLine:
     """Read a ``FLASER`` or ``RLASER`` line.
 
     Args:
         number: Its number in the file.
         line: The line.
-        tail_length: Number of words behind the readings, where earlier lines told.  A log
-            writes all its lines alike: a shorter one was cut off, perhaps within a number.
+        geometry: Gives the geometry of a number of readings, or raises ValueError.
 
     Raises:
         ValueError: The line is malformed; the message says how.
@@ -105,10 +105,9 @@ def parse_laser(number: int, line: bytes, tail_length: int | None = None) -> Sca
     words = line.split()
     tail_at = 2 + _count(words, 1)
     tail = words[tail_at:]
-    lengths = _LASER_TAILS if tail_length is None else (tail_length,)
-    if len(tail) not in lengths:
+    if len(tail) not in _LASER_TAILS:
         raise ValueError(
-            f"promises {tail_at - 2} readings and {lengths[0]} words behind them, "
+            f"promises {tail_at - 2} readings and {_LASER_TAILS[0]} words behind them, "
             f"but holds {len(words) - 2} words"
         )
     values = _numbers(tail[:7], "a pose or the time")
@@ -119,17 +118,18 @@ def parse_laser(number: int, line: bytes, tail_length: int | None = None) -> Sca
         _pose(values[:_POSE_LENGTH]),
         _pose(values[_POSE_LENGTH : 2 * _POSE_LENGTH]),
         _stamp(values[2 * _POSE_LENGTH :]),
-        None,
+        geometry(tail_at - 2),
         len(tail),
     )
 
 
-def parse_robot_laser(number: int, line: bytes) -> ScanLine:
+def parse_robot_laser(number: int, line: bytes, field_of_view: float | None = None) -> ScanLine:
     """Read a ``ROBOTLASER1`` line.
 
     Args:
         number: Its number in the file.
         line: The line.
+        field_of_view: Angle that the readings cover, radians, instead of the line's geometry.
 
     Raises:
         ValueError: The line is malformed; the message says how.
@@ -144,6 +144,10 @@ def parse_robot_laser(number: int, line: bytes) -> ScanLine:
             f"{tail_at + _ROBOT_LASER_TAIL} words, but holds {len(words)}"
         )
     start, _, resolution, range_max = _numbers(words[2:6], "the geometry")
+    geometry = ScanGeometry(start, resolution, range_max=range_max)
+    if field_of_view is not None:
+        count = remissions_at - _ROBOT_LASER_HEADER
+        geometry = geometry_of(count, field_of_view=field_of_view, range_max=range_max)
     values = _numbers(words[tail_at : tail_at + 2 * _POSE_LENGTH], "a pose")
     return ScanLine(
         number,
@@ -152,7 +156,7 @@ def parse_robot_laser(number: int, line: bytes) -> ScanLine:
         _pose(values[:_POSE_LENGTH]),
         _pose(values[_POSE_LENGTH:]),
         _stamp(_numbers(words[-3:-2], "the time")),
-        ScanGeometry(start, resolution, range_max=range_max),
+        geometry,
         _ROBOT_LASER_TAIL,
     )
 

@@ -4,8 +4,8 @@ A log has the same columns whether anybody filled them in or not:
 
 * poses that are zero in every one of several records, or that stand still while the other
   column or the scans show motion, were never filled in: the log has none;
-* odometry that equals the pose in every record is one trajectory written twice, as in
-  corrected logs: the log has the pose and no odometry;
+* odometry that goes with the pose, a fixed offset apart, is one trajectory written twice, as in
+  corrected logs: the log has the poses and no odometry;
 * a time that is zero in every record is no time.
 """
 
@@ -25,35 +25,46 @@ _MOVED_ANGLE = math.radians(30.0)
 _CHANGED_RANGE = 0.25
 # Poses that differ by less than the printed digits are one, metres and radians.
 _SAME = 2e-3
+_DAMAGED = 0.01
 
 
 class Survey:
     """What the columns of a log hold, gathered line by line."""
 
     def __init__(self) -> None:
+        self.count = 0
         self._poses = _Column()
         self._odometry = _Column()
-        self._is_one_trajectory = True
         self._first: ScanLine | None = None
         self._change = 0.0
         self._has_stamps = False
+        self._relative: Pose2D | None = None
+        self._apart = 0
 
-    def add(self, line: ScanLine, mounting: Pose2D) -> None:
-        """Count one scan line.
-
-        Args:
-            line: The line.
-            mounting: ``T_base_laser`` of its laser, as far as the log tells.
-        """
+    def add(self, line: ScanLine) -> None:
+        """Count one scan line."""
+        self.count += 1
         self._poses.add(line.laser)
         self._odometry.add(line.robot)
         self._has_stamps = self._has_stamps or bool(line.stamp)
-        if self._is_one_trajectory and line.laser is not None and line.robot is not None:
-            self._is_one_trajectory = _is_same(line.laser, line.robot) or _is_same(
-                line.laser, line.robot @ mounting
-            )
+        if line.laser is not None and line.robot is not None:
+            relative = line.robot.inverse() @ line.laser
+            if self._relative is None:
+                self._relative = relative
+            self._apart += not _is_same(relative, self._relative)
         if not (self._poses.moves and self._odometry.moves):
             self._compare(line)
+
+    @property
+    def is_one_trajectory(self) -> bool:
+        """Whether poses and odometry are one trajectory, perhaps of two places on the robot."""
+        # A damaged number here and there does not make a second trajectory.
+        return self._apart <= _DAMAGED * self.count
+
+    @property
+    def relative(self) -> Pose2D | None:
+        """``T_base_laser`` as the two columns have it, where they are one trajectory."""
+        return self._relative if self.is_one_trajectory else None
 
     @property
     def has_poses(self) -> bool:
@@ -63,7 +74,7 @@ class Survey:
     @property
     def has_odometry(self) -> bool:
         """Whether the odometry column was filled in, with something else than the poses."""
-        return not self._is_one_trajectory and self._odometry.is_filled(
+        return not self.is_one_trajectory and self._odometry.is_filled(
             motion_seen=self._poses.is_drive or self._scans_change
         )
 
