@@ -16,12 +16,16 @@ if TYPE_CHECKING:  # what type checkers and editors see; a test holds it equal t
     from .errors import ScanError as ScanError
     from .errors import SettingsError as SettingsError
     from .hypothesis import Hypothesis as Hypothesis
+    from .matcher import Matcher as Matcher
+    from .matcher import Trace as Trace
+    from .matcher import match as match
     from .occupancy import OccupancyGrid as OccupancyGrid
     from .pose import Pose2D as Pose2D
     from .record import Record as Record
     from .reference import Reference as Reference
     from .scan import LaserScan as LaserScan
     from .sensor import SensorModel as SensorModel
+    from .settings import Settings as Settings
     from .simulator import World as World
     from .simulator import drive as drive
     from .simulator import random_building as random_building
@@ -36,6 +40,7 @@ _HOMES = {
     "LaserScan": "scan",
     "Log": "io",
     "LogError": "errors",
+    "Matcher": "matcher",
     "MissingExtraError": "errors",
     "OccupancyGrid": "occupancy",
     "Pose2D": "pose",
@@ -45,9 +50,12 @@ _HOMES = {
     "ReferenceSetError": "errors",
     "ScanError": "errors",
     "SensorModel": "sensor",
+    "Settings": "settings",
     "SettingsError": "errors",
+    "Trace": "matcher",
     "World": "simulator",
     "drive": "simulator",
+    "match": "matcher",
     "open_log": "io",
     "random_building": "simulator",
     "simulate": "simulator",

@@ -1,0 +1,440 @@
+"""Section 5: synthetic scans and the evaluation e_m.
+
+Two scans of one place, taken from different poses, cannot be compared reading by reading.
+So it is checked first which of them contains the other's sensing position and therefore has
+the better *overview*: the position must lie in its field of view, nearer than what it sees
+there.  From the overview's points a *synthetic scan* is computed for the pose of the other,
+the *front scan*: neighbouring readings of one surface are joined by a straight line, and of
+all that lies in the direction of a beam the nearest counts.  Then
+
+    e_m = (readings of front and synthetic scan that differ by at most a tolerance)
+          / (readings of the front scan),
+
+where a reading of the front scan is a return; those without one say nothing of a distance.
+
+The paper does not say what to do when both or neither of the positions are visible.  If both
+are, the one with more free way behind the other's position has the better overview; if
+neither is, the one that faces the other's position more.  At equal claims it is the reference.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field
+
+from ._jit import kernel
+from .angle_function import (
+    CONNECTED,
+    FREE,
+    AngleFunction,
+    AngleFunctionSettings,
+    angle_function,
+)
+from .pose import Pose2D
+from .scan import LaserScan
+
+__all__ = [
+    "AcceptanceSettings",
+    "Evaluation",
+    "EvaluationSettings",
+    "Outline",
+    "OutlineStack",
+    "clearance",
+    "evaluate",
+    "evaluate_all",
+    "outline",
+    "probability",
+    "stack_outlines",
+    "synthetic_scan",
+]
+
+# Columns of the rows of an outline.
+_X, _Y, _RANGE, _BEAM, _GAP = range(5)
+_FULL_TURN = 2.0 * math.pi
+# A beam that misses the end of a line by less than this share of a step still meets it.
+_SLACK = 1e-6
+# So near its own position, metres, a scan sees every position.
+_HERE = 0.1
+
+
+class EvaluationSettings(BaseModel):
+    """Settings of the evaluation of section 5."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    tolerance: float = Field(0.2, gt=0.0, description="readings that differ no more agree, metres")
+
+
+class AcceptanceSettings(BaseModel):
+    """What an evaluation is worth: the probability of a hypothesis and the decision.
+
+    The paper answers where e_m reaches a threshold and is silent elsewhere.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    threshold: float = Field(0.8, ge=0.0, le=1.0, description="smallest e_m that is accepted")
+    even: float = Field(0.7, description="e_m at which a hypothesis is as likely right as wrong")
+    hypotheses: int = Field(5, ge=1, description="most hypotheses in an answer")
+    slope: float = Field(20.0, gt=0.0, description="growth of the log odds with e_m")
+
+
+@dataclass(frozen=True, eq=False)
+class Outline:
+    """What a scan saw, ready to be looked at from elsewhere.
+
+    Args:
+        rows: (V, 5) of every return, counter-clockwise: x, y and range (metres, scan frame),
+            direction of the beam (radians, ascending), and what follows before the next
+            return (as ``AngleFunction.gaps``; the last row is followed by the first).
+        geometry: (4,) direction of the first beam, angle between beams (both radians,
+            counter-clockwise), number of beams, and 1 for a full turn.
+    """
+
+    rows: NDArray[np.float64]
+    geometry: NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class OutlineStack:
+    """Several outlines one behind the other.
+
+    Args:
+        rows: (V, 5) as in ``Outline``.
+        starts: (C + 1,) where each outline begins.
+        geometries: (C, 4) as in ``Outline``.
+    """
+
+    rows: NDArray[np.float64]
+    starts: NDArray[np.int64]
+    geometries: NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluation:
+    """How well a scan and a reference agree in one alignment.
+
+    Args:
+        e_m: Share of the front scan's readings that agree, in [0, 1].
+        overview: Whether the ``"reference"`` or the ``"scan"`` has the better overview.
+        synthetic: The synthetic scan at the pose and with the beams of the front scan; NaN
+            where the overview saw nothing.
+    """
+
+    e_m: float
+    overview: str
+    synthetic: LaserScan
+
+
+def outline(scan: LaserScan, angles: AngleFunction) -> Outline:
+    """Prepare a scan for the evaluation.
+
+    Args:
+        scan: The scan.
+        angles: Its angle function, which knows what belongs to one surface.
+    """
+    rows = np.empty((len(angles.ranges), 5))
+    rows[:, :2] = angles.points
+    rows[:, _RANGE], rows[:, _BEAM], rows[:, _GAP] = angles.ranges, angles.beams, angles.gaps
+    step = abs(scan.angle_increment) or 1.0
+    count = max(min(len(scan), int(_FULL_TURN / step + 0.5)), 1)
+    first = scan.angle_min + min(scan.angle_increment, 0.0) * (count - 1)
+    return Outline(rows, np.array([first, step, count, scan.is_full_turn], np.float64))
+
+
+def stack_outlines(outlines: Sequence[Outline]) -> OutlineStack:
+    """Put outlines one behind the other; none at all gives an empty stack."""
+    return OutlineStack(
+        np.concatenate([_NO_ROWS, *(each.rows for each in outlines)]),
+        np.cumsum([0, *(len(each.rows) for each in outlines)]),
+        np.concatenate([_NO_GEOMETRIES, *(each.geometry[np.newaxis] for each in outlines)]),
+    )
+
+
+def clearance(overview: Outline, x: float, y: float) -> float:
+    """Tell how far a scan saw beyond a position; positive where it contains the position.
+
+    Args:
+        overview: The scan.
+        x: Of the position, metres, scan frame.
+        y: The same across.
+
+    Returns:
+        Range seen in the direction of the position minus its distance, metres; infinite
+        where nothing is in the way, minus infinite where the scan knows nothing.
+    """
+    return float(_clearance(overview.rows, overview.geometry, x, y))
+
+
+def evaluate_all(
+    scan: Outline,
+    references: OutlineStack,
+    candidates: NDArray[np.int64],
+    poses: NDArray[np.float64],
+    settings: EvaluationSettings,
+) -> NDArray[np.float64]:
+    """Compute e_m of many alignments of one scan (section 5).
+
+    Args:
+        scan: The scan.
+        references: The candidate references.
+        candidates: (N,) which reference each alignment is with.
+        poses: (N, 3) ``T_reference_scan`` as x, y, theta, metres and radians.
+        settings: Of the evaluation.
+
+    Returns:
+        (N,) e_m.
+    """
+    e_m: NDArray[np.float64] = _evaluations(
+        scan.rows,
+        scan.geometry,
+        references.rows,
+        references.starts,
+        references.geometries,
+        candidates,
+        poses,
+        settings.tolerance,
+    )
+    return e_m
+
+
+def evaluate(
+    scan: LaserScan,
+    reference: LaserScan,
+    T_reference_scan: Pose2D,
+    settings: EvaluationSettings | None = None,
+    surfaces: AngleFunctionSettings | None = None,
+) -> Evaluation:
+    """Evaluate one alignment and keep the synthetic scan (section 5).
+
+    Args:
+        scan: The scan.
+        reference: The reference scan.
+        T_reference_scan: The alignment.
+        settings: Of the evaluation; the defaults if None.
+        surfaces: Of the angle function, which tells what readings are joined.
+    """
+    settings = settings or EvaluationSettings()
+    surfaces = surfaces or AngleFunctionSettings()
+    ours = outline(scan, angle_function(scan, surfaces))
+    theirs = outline(reference, angle_function(reference, surfaces))
+    pose = T_reference_scan.to_array()
+    e_m = evaluate_all(
+        ours, stack_outlines([theirs]), np.zeros(1, np.int64), pose[np.newaxis], settings
+    )
+    if _reference_has_overview(ours.rows, ours.geometry, theirs.rows, theirs.geometry, pose):
+        synthetic = synthetic_scan(reference, T_reference_scan, scan, surfaces)
+        return Evaluation(float(e_m[0]), "reference", synthetic)
+    synthetic = synthetic_scan(scan, T_reference_scan.inverse(), reference, surfaces)
+    return Evaluation(float(e_m[0]), "scan", synthetic)
+
+
+def probability(e_m: NDArray[np.float64], settings: AcceptanceSettings) -> NDArray[np.float64]:
+    """Turn evaluations into probabilities of being right, by a logistic curve."""
+    return np.asarray(1.0 / (1.0 + np.exp(-settings.slope * (e_m - settings.even))))
+
+
+def synthetic_scan(
+    overview: LaserScan,
+    T_overview_front: Pose2D,
+    front: LaserScan,
+    surfaces: AngleFunctionSettings | None = None,
+) -> LaserScan:
+    """Compute what the front scan's sensor would have seen of the overview's surfaces.
+
+    Args:
+        overview: The scan whose points are used.
+        T_overview_front: Pose of the front scan's sensor in the overview's frame.
+        front: Gives the beams and the limits.
+        surfaces: Of the angle function, which tells what readings are joined.
+
+    Returns:
+        A scan with the beams of ``front``; NaN where the overview saw nothing.
+    """
+    angles = angle_function(overview, surfaces or AngleFunctionSettings())
+    # The front needs only its beams here: its geometry, not what it saw.
+    geometry = outline(front, angle_function(front, AngleFunctionSettings())).geometry
+    inverse = np.zeros(int(geometry[2]))
+    rows = outline(overview, angles).rows
+    _render(rows, T_overview_front.inverse().to_array(), geometry, inverse)
+    with np.errstate(divide="ignore"):
+        seen = np.where(inverse > 0.0, 1.0 / inverse, np.nan)
+    ranges = np.full(len(front), np.nan)
+    ranges[: len(seen)] = seen if front.angle_increment >= 0.0 else seen[::-1]
+    return LaserScan(
+        ranges, front.angle_min, front.angle_increment, front.range_min, front.range_max
+    )
+
+
+_NO_ROWS = np.empty((0, 5))
+_NO_GEOMETRIES = np.empty((0, 4))
+
+
+@kernel
+def _positive(angle):  # type: ignore[no-untyped-def]
+    """Wrap an angle into [0, 2 pi)."""
+    return angle - _FULL_TURN * math.floor(angle / _FULL_TURN)
+
+
+@kernel
+def _clearance(rows, geometry, x, y):  # type: ignore[no-untyped-def]
+    """Range seen towards a position minus its distance; see ``clearance``."""
+    count = len(rows)
+    distance = math.sqrt(x * x + y * y)
+    if distance <= _HERE:
+        return np.inf
+    if count == 0:
+        return -np.inf
+    step = geometry[1]
+    offset = _positive(math.atan2(y, x) - rows[0, _BEAM])
+    low, high = 0, count
+    while high - low > 1:
+        middle = (low + high) // 2
+        if rows[middle, _BEAM] - rows[0, _BEAM] <= offset:
+            low = middle
+        else:
+            high = middle
+    after = low + 1 if low + 1 < count else 0
+    begin = rows[low, _BEAM] - rows[0, _BEAM]
+    end = rows[after, _BEAM] - rows[0, _BEAM] if after > 0 else _FULL_TURN
+    share = (offset - begin) / max(end - begin, _SLACK)
+    near, far = rows[low, _RANGE], rows[after, _RANGE]
+    gap = rows[low, _GAP]
+    if gap == CONNECTED:
+        return 1.0 / ((1.0 - share) / near + share / far) - distance
+    if gap == FREE:
+        return np.inf
+    # Between two surfaces, or at the rim of the field of view, the nearest beam answers.
+    if min(offset - begin, end - offset) > step:
+        return -np.inf
+    return (near if share < 0.5 else far) - distance
+
+
+@kernel
+def _reference_has_overview(rows, geometry, reference_rows, reference_geometry, pose):  # type: ignore[no-untyped-def]
+    """Tell whether the reference, not the scan, has the better overview."""
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    # The reference's sensing position in the frame of the scan.
+    x, y = -c * pose[0] - s * pose[1], s * pose[0] - c * pose[1]
+    theirs = _clearance(reference_rows, reference_geometry, pose[0], pose[1])
+    ours = _clearance(rows, geometry, x, y)
+    if theirs > 0.0 or ours > 0.0:
+        return theirs >= ours
+    return _aside(reference_geometry, pose[0], pose[1]) <= _aside(geometry, x, y)
+
+
+@kernel
+def _aside(geometry, x, y):  # type: ignore[no-untyped-def]
+    """Angle between the middle of the field of view and a position, radians."""
+    middle = geometry[0] + 0.5 * geometry[1] * (geometry[2] - 1.0)
+    return abs(_positive(math.atan2(y, x) - middle + math.pi) - math.pi)
+
+
+@kernel
+def _render(rows, pose, geometry, inverse):  # type: ignore[no-untyped-def]
+    """Draw an outline, carried by ``pose`` (T_front_overview), into inverse ranges per beam.
+
+    Over an angle, the inverse range of a straight line is all but linear between two close
+    directions; where they are far apart the exact formula is taken.
+    """
+    count = len(rows)
+    if count == 0:
+        return
+    first, step = geometry[0], geometry[1]
+    period = _FULL_TURN / step
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    last = count - 1
+    x = c * rows[last, _X] - s * rows[last, _Y] + pose[0]
+    y = s * rows[last, _X] + c * rows[last, _Y] + pose[1]
+    k = _positive(math.atan2(y, x) - first) / step
+    over = 1.0 / max(math.sqrt(x * x + y * y), _SLACK)
+    joined = rows[last, _GAP] == CONNECTED
+    for i in range(count):
+        k_before, over_before, joined_before = k, over, joined
+        x = c * rows[i, _X] - s * rows[i, _Y] + pose[0]
+        y = s * rows[i, _X] + c * rows[i, _Y] + pose[1]
+        k = _positive(math.atan2(y, x) - first) / step
+        over = 1.0 / max(math.sqrt(x * x + y * y), _SLACK)
+        joined = rows[i, _GAP] == CONNECTED
+        if joined_before:
+            span = k - k_before
+            if span > 0.5 * period:
+                span -= period
+            elif span < -0.5 * period:
+                span += period
+            if span >= 0.0:
+                _draw(k_before, span, over_before, over, step, period, inverse)
+            else:
+                _draw(k, -span, over, over_before, step, period, inverse)
+        elif not joined:
+            _draw(k - 0.5 + _SLACK, 1.0 - 3.0 * _SLACK, over, over, step, period, inverse)
+
+
+@kernel
+def _draw(k, span, over, over_end, step, period, inverse):  # type: ignore[no-untyped-def]
+    """Draw a line from beam coordinate ``k`` over ``span`` beams; the nearest remains."""
+    if k < 0.0:
+        k += period
+    wide = span * step > 0.3
+    denominator = math.sin(span * step) if wide else 1.0
+    if denominator < _SLACK:
+        return
+    for lap in range(2):
+        begin = k - lap * period
+        low = max(math.ceil(begin - _SLACK), 0.0)
+        high = min(math.floor(begin + span + _SLACK), len(inverse) - 1.0)
+        for beam in range(int(low), int(high) + 1):
+            along = min(max(beam - begin, 0.0), span)
+            if wide:
+                value = math.sin((span - along) * step) * over + math.sin(along * step) * over_end
+                value /= denominator
+            elif span > 0.0:
+                value = over + (over_end - over) * along / span
+            else:
+                value = max(over, over_end)
+            inverse[beam] = max(inverse[beam], value)
+
+
+@kernel
+def _agreement(rows, geometry, inverse, tolerance):  # type: ignore[no-untyped-def]
+    """Share of the front scan's returns that agree with the synthetic scan."""
+    agree = 0
+    for i in range(len(rows)):
+        beam = int(_positive(rows[i, _BEAM] - geometry[0] + _SLACK) / geometry[1] + 0.5)
+        if beam >= len(inverse) or inverse[beam] <= 0.0:
+            continue
+        if abs(1.0 / inverse[beam] - rows[i, _RANGE]) <= tolerance:
+            agree += 1
+    return agree / len(rows) if len(rows) > 0 else 0.0
+
+
+@kernel
+def _evaluations(rows, geometry, all_rows, starts, geometries, candidates, poses, tolerance):  # type: ignore[no-untyped-def]
+    """(N,) e_m of all alignments."""
+    e_m = np.empty(len(poses))
+    most = geometry[2]
+    for c in range(len(geometries)):
+        most = max(most, geometries[c, 2])
+    scratch = np.empty(int(most))
+    for n in range(len(poses)):
+        c = candidates[n]
+        reference_rows = all_rows[starts[c] : starts[c + 1]]
+        pose = poses[n]
+        if _reference_has_overview(rows, geometry, reference_rows, geometries[c], pose):
+            inverse = scratch[: int(geometry[2])]
+            inverse[:] = 0.0
+            co, si = math.cos(pose[2]), math.sin(pose[2])
+            back = np.array((-co * pose[0] - si * pose[1], si * pose[0] - co * pose[1], -pose[2]))
+            _render(reference_rows, back, geometry, inverse)
+            e_m[n] = _agreement(rows, geometry, inverse, tolerance)
+        else:
+            inverse = scratch[: int(geometries[c, 2])]
+            inverse[:] = 0.0
+            _render(rows, pose, geometries[c], inverse)
+            e_m[n] = _agreement(reference_rows, geometries[c], inverse, tolerance)
+    return e_m

@@ -1,0 +1,129 @@
+"""All settings: one section per stage, and the presets.
+
+``paper`` does what the paper says and nothing more, so that its figures stay reproducible.
+Where the paper names no figure, the field's description in the section says what it is for,
+and the value is the one that did best on the logs named in the module that uses it.
+"""
+
+from __future__ import annotations
+
+import difflib
+import types
+from collections.abc import Mapping
+from typing import Any, get_args
+
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    ModelWrapValidatorHandler,
+    ValidationError,
+    model_validator,
+)
+
+from .alignment import AlignmentSettings
+from .anchors import AnchorSettings
+from .database import DatabaseSettings
+from .errors import SettingsError
+from .evaluation import AcceptanceSettings, EvaluationSettings
+from .graph import GraphSettings
+
+__all__ = ["PRESETS", "Settings"]
+
+# What a preset says differently from the defaults of the sections.
+PRESETS: Mapping[str, Mapping[str, Any]] = types.MappingProxyType(
+    {"default": {}, "paper": {}, "thorough": {"database": {"candidates": 30}}}
+)
+
+
+class Settings(BaseModel):
+    """Settings of every stage, from scan to decision."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    anchors: AnchorSettings = AnchorSettings()
+    graph: GraphSettings = GraphSettings()
+    database: DatabaseSettings = DatabaseSettings()
+    alignment: AlignmentSettings = AlignmentSettings()
+    evaluation: EvaluationSettings = EvaluationSettings()
+    acceptance: AcceptanceSettings = AcceptanceSettings()
+
+    @classmethod
+    def preset(cls, name: str = "default") -> Settings:
+        """Return a preset: ``default``, ``paper`` or ``thorough``.
+
+        Raises:
+            SettingsError: There is no preset of that name.
+        """
+        if name not in PRESETS:
+            raise SettingsError(f"unknown preset {name!r}{_nearest(name, PRESETS)}")
+        return cls.model_validate(PRESETS[name])
+
+    @classmethod
+    def from_json(cls, text: str | bytes) -> Settings:
+        """Read settings from JSON; what is left out has its default.
+
+        Raises:
+            SettingsError: The text is no JSON, a name is unknown or a value impossible.
+        """
+        return cls.model_validate_json(text)
+
+    def to_json(self) -> str:
+        """Write all settings as JSON."""
+        return self.model_dump_json(indent=2)
+
+    def changed(self, changes: Mapping[str, Any]) -> Settings:
+        """Return a copy with some values replaced.
+
+        Args:
+            changes: Nested as the sections are, ``{"database": {"candidates": 10}}``.
+
+        Raises:
+            SettingsError: A name is unknown or a value impossible.
+        """
+        return type(self).model_validate(_merged(self.model_dump(), changes))
+
+    @model_validator(mode="wrap")
+    @classmethod
+    def _explain(cls, values: Any, handler: ModelWrapValidatorHandler[Settings]) -> Settings:
+        try:
+            return handler(values)
+        except ValidationError as error:
+            raise SettingsError(_explanation(cls, error)) from None
+
+
+def _merged(values: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    merged = dict(values)
+    for name, change in changes.items():
+        old = merged.get(name)
+        both = isinstance(old, Mapping) and isinstance(change, Mapping)
+        merged[name] = _merged(old, change) if both else change  # type: ignore[arg-type]
+    return merged
+
+
+def _explanation(model: type[BaseModel], error: ValidationError) -> str:
+    """Say in one line what is wrong with the first setting that is."""
+    first = error.errors(include_url=False)[0]
+    path = [str(part) for part in first["loc"]]
+    where = ".".join(path) or "settings"
+    if first["type"] != "extra_forbidden":
+        return f"{where}: {first['msg']}"
+    section: type[BaseModel] = model
+    for part in path[:-1]:
+        section = _section(section, part)
+    return f"unknown setting {where!r}{_nearest(path[-1], section.model_fields, path[:-1])}"
+
+
+def _section(model: type[BaseModel], name: str) -> type[BaseModel]:
+    """Return the model of a section."""
+    annotation = model.model_fields[name].annotation
+    for kind in (annotation, *get_args(annotation)):
+        if isinstance(kind, type) and issubclass(kind, BaseModel):
+            return kind
+    return model
+
+
+def _nearest(name: str, known: Mapping[str, Any], path: list[str] | None = None) -> str:
+    """Suggest the known name that looks most like an unknown one, or list them all."""
+    close = difflib.get_close_matches(name, known, n=1, cutoff=0.0)
+    prefix = "".join(f"{part}." for part in path or ())
+    return f"; did you mean {prefix + close[0]!r}?" if close else ""
