@@ -1,0 +1,64 @@
+# The six verbs: setup, check, test, bench, docs, release; and the demo. CI calls the same ones.
+# Nothing is needed beforehand but Python 3.10 or later: every verb sets up .venv by itself.
+
+PYTHON ?= python3
+VENV ?= .venv
+BIN := $(VENV)/bin
+PYTEST_ARGS ?=
+
+.DEFAULT_GOAL := help
+.PHONY: help setup check test bench docs release demo picture lock clean
+
+help: ## show this list
+	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "  make %-9s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
+
+setup: $(VENV)/.ready ## make .venv with the package (editable) and the pinned tools
+
+# A Python without ensurepip (some distributions split it off) still gets pip, from the one outside.
+$(VENV)/.ready: requirements-dev.txt pyproject.toml
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 10))' || \
+		{ echo "error: $(PYTHON) is too old; try make PYTHON=python3.11 (3.10 or later)" >&2; exit 1; }
+	$(PYTHON) -m venv $(VENV) 2>/dev/null || { $(PYTHON) -m venv --clear --without-pip $(VENV) && \
+		$(PYTHON) -m pip --python $(BIN)/python install --quiet pip; }
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements-dev.txt
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e .
+	@touch $@
+
+check: setup ## lint, format and types
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+test: check ## check, then every test
+	$(BIN)/python -m pytest $(PYTEST_ARGS)
+
+bench: setup ## the protocols on the logs in ANCHORSCAN_DATA
+	$(BIN)/anchorscan bench
+
+docs: setup ## build the documentation strictly, into site/
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+
+release: setup ## build both distributions and try the wheel in an empty environment
+	rm -rf dist $(VENV)-release
+	$(BIN)/python -m build --no-isolation
+	$(PYTHON) -m venv $(VENV)-release
+	$(VENV)-release/bin/python -m pip install --quiet --disable-pip-version-check \
+		"anchorscan[demo] @ file://$(CURDIR)/$$(ls dist/*.whl)"
+	cd dist && ../$(VENV)-release/bin/anchorscan --version && ../$(VENV)-release/bin/anchorscan demo
+	@grep -q "^## $$($(BIN)/anchorscan --version | cut -d' ' -f2) " CHANGELOG.md || \
+		echo "note: CHANGELOG.md has no entry for this version yet; tag only after it has one"
+
+demo: setup ## build a map of MIT Killian Court and locate later visits in it
+	$(BIN)/anchorscan demo
+
+picture: setup ## draw the picture of the README again
+	$(BIN)/anchorscan demo --output docs/images
+
+lock: setup ## resolve requirements-dev.txt anew, for Python 3.10 and later
+	$(BIN)/python -m pip install --quiet uv
+	$(BIN)/uv pip compile --quiet --upgrade --universal --python-version 3.10 --all-extras \
+		--generate-hashes --no-emit-index-url --custom-compile-command "make lock" \
+		pyproject.toml --output-file requirements-dev.txt
+
+clean: ## remove what the verbs made
+	rm -rf $(VENV) $(VENV)-release site dist build .mypy_cache .ruff_cache .pytest_cache

@@ -1,0 +1,590 @@
+"""The command line: what to read and where to write; the work is done elsewhere.
+
+Results go to stdout or to a file, messages and progress to stderr.  The exit code is 0, 1 for
+an error that is known (one line says what to do), 2 for a command that makes no sense; what is
+not known ends in a traceback, because it is our mistake.  Every heavy module is imported by the
+command that needs it, so that ``--help`` answers at once.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import signal
+import sys
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from functools import wraps
+from itertools import islice
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, TextIO, TypeVar
+
+import typer
+
+from . import __version__
+from .errors import AnchorscanError, LogError, SettingsError
+
+if TYPE_CHECKING:
+    from .hypothesis import Hypothesis
+    from .io import Log
+    from .pose import Pose2D
+    from .record import Record
+    from .reference_set import ReferenceSet, SetInfo
+    from .settings import Settings
+
+__all__ = ["app", "main"]
+
+_FAILED = 1
+_PROGRESS_DELAY = 1.0
+_PROGRESS_INTERVAL = 0.1
+# How many malformed lines a message names before it says "and so on".
+_NAMED_LINES = 5
+# Digits that a user can use: a micrometre, a microradian, and six of a covariance.
+_DECIMALS = 6
+# Scans that a worker process takes at once, and how many such lots may wait for it.
+_CHUNK = 16
+_CHUNKS_AHEAD = 4
+
+app = typer.Typer(
+    name="anchorscan",
+    help="Where a robot is, from one 2D laser scan and no prior guess.",
+    no_args_is_help=True,
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+Command = TypeVar("Command", bound=Callable[..., None])
+Item = TypeVar("Item")
+
+
+def main() -> None:
+    """Run the command line (the entry point of ``anchorscan``)."""
+    app()
+
+
+def _guarded(command: Command) -> Command:
+    """End known errors as one line, and an interrupted or unread run without a word."""
+
+    @wraps(command)
+    def guarded(*args: Any, **kwargs: Any) -> None:
+        try:
+            command(*args, **kwargs)
+            sys.stdout.flush()
+        except AnchorscanError as error:
+            _say(f"error: {error}")
+            raise typer.Exit(_FAILED) from None
+        except BrokenPipeError:
+            # Whoever read us (head, less) has seen enough; what is buffered has no reader.
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            raise typer.Exit(128 + signal.SIGPIPE) from None
+        except KeyboardInterrupt:
+            raise typer.Exit(128 + signal.SIGINT) from None
+        except OSError as error:
+            if error.filename is None and error.errno is None:
+                raise
+            place = "" if error.filename is None else f"{error.filename}: "
+            _say(f"error: {place}{error.strerror}")
+            raise typer.Exit(_FAILED) from None
+
+    return guarded  # type: ignore[return-value]
+
+
+def _show_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"anchorscan {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _root(
+    version: Annotated[
+        bool,
+        typer.Option(
+            "--version", callback=_show_version, is_eager=True, help="Print the version and exit."
+        ),
+    ] = False,
+) -> None:
+    """Where a robot is, from one 2D laser scan and no prior guess."""
+
+
+# Arguments and options that several commands share.
+
+
+def _parse_candidates(text: str) -> int | str:
+    if text == "all":
+        return text
+    if text.isdecimal() and int(text) > 0:
+        return int(text)
+    raise typer.BadParameter(f"{text!r} is neither a positive number nor 'all'")
+
+
+def _parse_preset(text: str) -> str:
+    if text not in ("default", "paper", "thorough"):
+        raise typer.BadParameter(f"{text!r} is none of default, paper, thorough")
+    return text
+
+
+SetArgument = Annotated[Path, typer.Argument(metavar="SET", help="A reference set.")]
+LogArgument = Annotated[Path, typer.Argument(metavar="LOG", help="A log of laser scans.")]
+FieldOfViewOption = Annotated[
+    float | None,
+    typer.Option(metavar="DEG", help="What the readings cover, if the log does not tell."),
+]
+RangeMaxOption = Annotated[
+    float | None,
+    typer.Option(metavar="M", help="From this range on a reading means 'no return'."),
+]
+PresetOption = Annotated[
+    str | None,
+    typer.Option(
+        parser=_parse_preset, metavar="PRESET", help="Settings: default, paper or thorough."
+    ),
+]
+SettingsOption = Annotated[
+    Path | None,
+    typer.Option("--settings", metavar="FILE", help="Settings from a JSON file."),
+]
+
+
+@app.command()
+@_guarded
+def build(
+    logs: Annotated[
+        list[Path], typer.Argument(metavar="LOG...", help="Logs of laser scans with poses.")
+    ],
+    output: Annotated[
+        Path, typer.Option("--output", "-o", metavar="SET", help="The reference set to write.")
+    ],
+    spacing: Annotated[
+        float, typer.Option(min=0.0, metavar="M", help="Metres between references ...")
+    ] = 2.0,
+    heading: Annotated[
+        float, typer.Option(min=0.0, max=180.0, metavar="DEG", help="... or degrees.")
+    ] = 45.0,
+    keep_all: Annotated[bool, typer.Option("--all", help="Keep every scan with a pose.")] = False,
+    odometry_poses: Annotated[
+        bool,
+        typer.Option(
+            "--odometry-poses", help="The log is raw: its x y theta columns are odometry."
+        ),
+    ] = False,
+    field_of_view: FieldOfViewOption = None,
+    range_max: RangeMaxOption = None,
+    preset: PresetOption = None,
+    settings_file: SettingsOption = None,
+) -> None:
+    """Make a reference set from the scans of logs with poses.
+
+    A scan becomes a reference when no reference lies within the spacing and the heading of it.
+    """
+    from .reference_set import ReferenceSet
+
+    settings = _read_settings(preset, settings_file)
+    opened = [
+        _open_log(log, field_of_view, range_max, "odometry" if odometry_poses else "corrected")
+        for log in logs
+    ]
+    records = _progress(_all_records(opened), "reading", _total(opened))
+    with ReferenceSet.build(
+        records,
+        spacing=spacing,
+        heading=math.radians(heading),
+        keep_all=keep_all,
+        settings=settings,
+        path=output,
+    ) as places:
+        info = places.info()
+    _say(f"{output}: {info.references} references{_source(info)}")
+
+
+@app.command()
+@_guarded
+def locate(
+    set_file: SetArgument,
+    log: LogArgument,
+    candidates: Annotated[
+        Any,
+        typer.Option(
+            parser=_parse_candidates,
+            metavar="K|all",
+            help="How many references to align with, instead of what the settings say.",
+        ),
+    ] = None,
+    output: Annotated[
+        Path | None,
+        typer.Option("--output", "-o", metavar="OUT", help="File for the JSON lines, not stdout."),
+    ] = None,
+    processes: Annotated[
+        int, typer.Option(min=1, metavar="N", help="Share the scans among processes.")
+    ] = 1,
+    field_of_view: FieldOfViewOption = None,
+    range_max: RangeMaxOption = None,
+    preset: PresetOption = None,
+    settings_file: SettingsOption = None,
+) -> None:
+    """Say where every scan of a log was taken, each on its own, with no prior.
+
+    One JSON object a scan, in the order of the log, hypotheses best first; the poses are those
+    of the laser in the frame of the set, in metres and radians.
+    """
+    opened = _open_log(log, field_of_view, range_max)
+    settings = _read_settings(preset, settings_file)
+    records = _progress(opened, "locating", opened.count)
+    accepted = unusable = count = 0
+    with _writing(output) as stream:
+        for line in _located(records, set_file, settings, candidates, processes):
+            stream.write(json.dumps(line, allow_nan=False) + "\n")
+            stream.flush()
+            count += 1
+            accepted += line["accepted"]
+            unusable += "reason" in line
+    _report_problems(opened)
+    _say(
+        f"{log}: {count} scans: {accepted} located, {count - accepted - unusable} not known, "
+        f"{unusable} unusable"
+    )
+
+
+@app.command()
+@_guarded
+def info(
+    set_file: SetArgument,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+) -> None:
+    """Say what a reference set holds."""
+    from .reference_set import ReferenceSet
+
+    with ReferenceSet.open(set_file) as places:
+        facts = _facts(places.info())
+    if as_json:
+        typer.echo(json.dumps(facts))
+        return
+    for name, value in facts.items():
+        if value is not None:
+            typer.echo(f"{name.replace('_', ' ') + ':':<13}{_in_words(name, value)}")
+
+
+@app.command()
+@_guarded
+def demo(
+    output: Annotated[
+        Path, typer.Option("--output", "-o", metavar="DIR", help="Folder for the pictures.")
+    ] = Path("anchorscan-demo"),
+    preset: PresetOption = None,
+) -> None:
+    """Locate later visits to the MIT Killian Court in a map made of the first ones."""
+    from .demo import run
+
+    run(output, _read_settings(preset, None), say=typer.echo, progress=_progress)
+
+
+# Reading
+
+
+def _open_log(
+    path: Path, field_of_view: float | None, range_max: float | None, pose_columns: Any = None
+) -> Log:
+    from .io import open_log
+
+    return open_log(
+        path,
+        field_of_view=None if field_of_view is None else math.radians(field_of_view),
+        range_max=range_max,
+        **({} if pose_columns is None else {"pose_columns": pose_columns}),
+    )
+
+
+def _all_records(logs: list[Log]) -> Iterator[Record]:
+    for log in logs:
+        yield from log
+        _report_problems(log)
+
+
+def _total(logs: list[Log]) -> int | None:
+    total = 0
+    for log in logs:
+        if log.count is None:
+            return None
+        total += log.count
+    return total
+
+
+def _report_problems(log: Log) -> None:
+    """Say once which lines of a log were no use, by number and first reason."""
+    if not log.problem_count:
+        return
+    first = [str(problem.line) for problem in log.problems[:_NAMED_LINES]]
+    more = ", ..." if log.problem_count > len(first) else ""
+    lines = "line" if log.problem_count == 1 else "lines"
+    _say(
+        f"warning: {log.path}: {log.problem_count} malformed {lines} "
+        f"({', '.join(first)}{more}); the first: {log.problems[0].reason}"
+    )
+
+
+def _read_settings(preset: str | None, path: Path | None) -> Settings | None:
+    """Return the settings asked for; None leaves the choice to the reference set."""
+    if preset is None and path is None:
+        return None
+    from .settings import Settings
+
+    if path is None:
+        return Settings.preset(preset or "default")
+    if preset is not None:
+        raise typer.BadParameter("give --preset or --settings, not both")
+    try:
+        return Settings.from_json(path.read_text(encoding="utf-8"))
+    except UnicodeDecodeError:
+        raise SettingsError(f"{path}: not a settings file (JSON in UTF-8)") from None
+
+
+# Locating
+
+
+class _Locator:
+    """Locates records in an opened set; one for every process."""
+
+    def __init__(self, set_file: Path, settings: Settings | None, candidates: Any) -> None:
+        from .reference_set import ReferenceSet
+
+        self._places: ReferenceSet = ReferenceSet.open(set_file, settings=settings)
+        self._candidates = candidates
+        self._places.prepare()
+
+    def line(self, record: Record) -> dict[str, Any]:
+        """Return the line of ``locate`` for a record."""
+        hypotheses: list[Hypothesis] = []
+        start = time.perf_counter()
+        if record.scan is not None:
+            hypotheses = self._places.locate(record.scan, self._candidates)
+        seconds = time.perf_counter() - start
+        line: dict[str, Any] = {
+            "scan": record.index,
+            "stamp": record.stamp,
+            "seconds": round(seconds, _DECIMALS + 1),
+            "accepted": bool(hypotheses) and hypotheses[0].accepted,
+            "hypotheses": [_hypothesis_line(hypothesis) for hypothesis in hypotheses],
+        }
+        if not hypotheses:
+            line["reason"] = self._reason(record)
+        return line
+
+    def _reason(self, record: Record) -> str:
+        if record.scan is None:
+            return record.problem
+        return "no reading is a return" if len(self._places) else "the set has no references"
+
+
+def _hypothesis_line(hypothesis: Hypothesis) -> dict[str, Any]:
+    return {
+        "reference": hypothesis.reference,
+        **_pose_line(hypothesis.pose),
+        "covariance": [[_significant(value) for value in row] for row in hypothesis.covariance],
+        "evaluation": round(hypothesis.evaluation, _DECIMALS),
+        "quality": round(hypothesis.quality, _DECIMALS),
+        "probability": round(hypothesis.probability, _DECIMALS),
+        "score": _significant(hypothesis.score),
+        "pose_in_reference": _pose_line(hypothesis.pose_in_reference),
+    }
+
+
+def _pose_line(pose: Pose2D | None) -> dict[str, float | None]:
+    if pose is None:  # the set has no common frame
+        return {"x": None, "y": None, "theta": None}
+    return {name: round(getattr(pose, name), _DECIMALS) for name in ("x", "y", "theta")}
+
+
+def _significant(value: float) -> float:
+    return float(f"{value:.{_DECIMALS}g}")
+
+
+def _located(
+    records: Iterable[Record],
+    set_file: Path,
+    settings: Settings | None,
+    candidates: Any,
+    processes: int,
+) -> Iterator[dict[str, Any]]:
+    """Yield the lines of ``locate`` in the order of the records."""
+    locator = _Locator(set_file, settings, candidates)
+    if processes == 1:
+        yield from map(locator.line, records)
+        return
+    import multiprocessing
+    from concurrent.futures import Future, ProcessPoolExecutor
+
+    # The kernels are compiled by now, and the others load them from numba's cache.
+    del locator
+    # Spawned, because the thread that draws the progress must not be forked.
+    with ProcessPoolExecutor(
+        processes,
+        multiprocessing.get_context("spawn"),
+        _start_worker,
+        (set_file, settings, candidates),
+    ) as pool:
+        pending: deque[Future[list[dict[str, Any]]]] = deque()
+        remaining = iter(records)
+        for chunk in iter(lambda: list(islice(remaining, _CHUNK)), []):
+            pending.append(pool.submit(_work, chunk))
+            if len(pending) > _CHUNKS_AHEAD * processes:
+                yield from pending.popleft().result()
+        for future in pending:
+            yield from future.result()
+
+
+_worker: _Locator | None = None
+
+
+def _start_worker(set_file: Path, settings: Settings | None, candidates: Any) -> None:
+    global _worker  # noqa: PLW0603 - a worker process holds nothing else
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent is told, and ends the workers
+    _worker = _Locator(set_file, settings, candidates)
+
+
+def _work(records: list[Record]) -> list[dict[str, Any]]:
+    assert _worker is not None
+    return [_worker.line(record) for record in records]
+
+
+# What a set holds
+
+
+def _source(info: SetInfo) -> str:
+    """Say what a set was built from."""
+    build = info.build
+    if build is None:
+        return ""
+    parts = [f" from {build.consumed} scans"]
+    if build.unusable:
+        parts.append(f"{build.unusable} unusable")
+    if build.without_pose:
+        parts.append(f"{build.without_pose} without a pose")
+    return ", ".join(parts)
+
+
+def _facts(info: SetInfo) -> dict[str, Any]:
+    build = info.build
+    return {
+        "file": str(info.path),
+        "bytes": info.size,
+        "format": info.format,
+        "name": info.name or None,
+        "references": info.references,
+        "with_pose": info.with_pose,
+        "bounds": info.bounds,
+        "sensors": [
+            {
+                "scans": count,
+                "readings": sensor.readings,
+                "field_of_view": abs(sensor.angle_increment) * max(sensor.readings - 1, 0),
+                "angle_min": sensor.angle_min,
+                "angle_increment": sensor.angle_increment,
+                "range_max": sensor.range_max,
+            }
+            for sensor, count in info.sensors
+        ],
+        "build": None
+        if build is None
+        else {
+            "spacing": build.spacing,
+            "heading": build.heading,
+            "keep_all": build.keep_all,
+            "scans": build.consumed,
+            "unusable": build.unusable,
+            "without_pose": build.without_pose,
+            "finished": build.finished,
+        },
+    }
+
+
+def _in_words(name: str, value: Any) -> str:
+    """Say a fact as a person would."""
+    if name == "bytes":
+        return f"{value:,}"
+    if name == "bounds":
+        left, bottom, right, top = value
+        return f"x {left:.1f} to {right:.1f} m, y {bottom:.1f} to {top:.1f} m"
+    if name == "sensors":
+        return "; ".join(
+            f"{each['scans']} scans of {each['readings']} readings over "
+            f"{math.degrees(each['field_of_view']):.0f} degrees, up to {each['range_max']:g} m"
+            for each in value
+        )
+    if name == "build":
+        rule = f"one per {value['spacing']:g} m and {math.degrees(value['heading']):g} degrees"
+        state = "" if value["finished"] else "; not finished, build it again to go on"
+        return f"{'every scan' if value['keep_all'] else rule}, of {value['scans']} scans{state}"
+    return str(value)
+
+
+# Writing
+
+
+def _say(message: str) -> None:
+    """Tell the user something that is no result."""
+    typer.echo(message, err=True)
+
+
+@contextmanager
+def _writing(path: Path | None) -> Iterator[TextIO]:
+    """Give a stream to stdout or to a file that appears only when it is whole."""
+    if path is None:
+        yield sys.stdout
+        return
+    target = path.resolve()
+    if target.exists() and not target.is_file():  # a pipe or a device is written, not replaced
+        with target.open("w", encoding="utf-8") as stream:
+            yield stream
+        return
+    draft = target.with_name(f".{target.name}.{os.getpid()}.part")
+    try:
+        with draft.open("w", encoding="utf-8") as stream:
+            yield stream
+        draft.replace(target)
+    except OSError as error:
+        if isinstance(error, BrokenPipeError):
+            raise
+        raise LogError(f"cannot be written: {error.strerror}", path) from None
+    finally:
+        draft.unlink(missing_ok=True)
+
+
+def _progress(items: Iterable[Item], what: str, total: int | None = None) -> Iterator[Item]:
+    """Pass items on; show on a terminal how many, once that has taken a second."""
+    if not sys.stderr.isatty():
+        yield from items
+        return
+    from rich.console import Console
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+
+    columns = (
+        TextColumn(what),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+    )
+    bar = Progress(*columns, console=Console(stderr=True), transient=True, auto_refresh=False)
+    begin = shown = time.monotonic()
+    task = bar.add_task(what, total=total)
+    try:
+        for done, item in enumerate(items, start=1):
+            yield item
+            now = time.monotonic()
+            if now - begin > _PROGRESS_DELAY and now - shown > _PROGRESS_INTERVAL:
+                bar.start()
+                bar.update(task, completed=done, refresh=True)
+                shown = now
+    finally:
+        bar.stop()
