@@ -23,6 +23,7 @@ if TYPE_CHECKING:  # what type checkers and editors see; a test holds it equal t
     from .pose import Pose2D as Pose2D
     from .record import Record as Record
     from .reference import Reference as Reference
+    from .reference_set import ReferenceSet as ReferenceSet
     from .scan import LaserScan as LaserScan
     from .sensor import SensorModel as SensorModel
     from .settings import Settings as Settings
@@ -47,6 +48,7 @@ _HOMES = {
     "Problem": "io",
     "Record": "record",
     "Reference": "reference",
+    "ReferenceSet": "reference_set",
     "ReferenceSetError": "errors",
     "ScanError": "errors",
     "SensorModel": "sensor",
