@@ -16,6 +16,10 @@ if TYPE_CHECKING:  # what type checkers and editors see; a test holds it equal t
     from .errors import ScanError as ScanError
     from .errors import SettingsError as SettingsError
     from .hypothesis import Hypothesis as Hypothesis
+    from .io import Log as Log
+    from .io import Problem as Problem
+    from .io import open_log as open_log
+    from .io import write_tum as write_tum
     from .matcher import Matcher as Matcher
     from .matcher import Trace as Trace
     from .matcher import match as match

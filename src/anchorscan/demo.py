@@ -190,7 +190,7 @@ def draw(outcome: Demonstration) -> Figure:
     _require_matplotlib()
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(12.0, 6.4), dpi=110, layout="constrained", facecolor="white")
+    figure = Figure(figsize=(10.4, 5.6), dpi=130, layout="constrained", facecolor="white")
     grid = figure.add_gridspec(2, 2, width_ratios=(1.9, 1.0))
     _draw_map(figure.add_subplot(grid[:, 0]), outcome)
     shown = _to_show(outcome)
@@ -246,7 +246,7 @@ def _draw_map(axes: Axes, outcome: Demonstration) -> None:
     )
     handles = [
         _mark("o", _RIGHT, f"located and correct: {len(right)}", filled=True),
-        _mark("X", _WRONG, f"located and wrong, with a line to the answer: {len(wrong)}", True),
+        _mark("X", _WRONG, f"located and wrong (line to the answer): {len(wrong)}", True),
         _mark("o", _UNKNOWN, f"“not known”: {len(unknown)}", filled=False),
     ]
     axes.legend(
