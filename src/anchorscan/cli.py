@@ -338,6 +338,8 @@ def _read_settings(preset: str | None, path: Path | None) -> Settings | None:
         raise typer.BadParameter("give --preset or --settings, not both")
     try:
         return Settings.from_json(path.read_text(encoding="utf-8"))
+    except SettingsError as error:
+        raise SettingsError(f"{path}: {error}") from None
     except UnicodeDecodeError:
         raise SettingsError(f"{path}: not a settings file (JSON in UTF-8)") from None
 
