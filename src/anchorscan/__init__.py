@@ -20,10 +20,14 @@ if TYPE_CHECKING:  # what type checkers and editors see; a test holds it equal t
     from .io import Problem as Problem
     from .io import open_log as open_log
     from .io import write_tum as write_tum
+    from .map_file import load_map as load_map
+    from .map_file import write_map as write_map
     from .matcher import Matcher as Matcher
     from .matcher import Trace as Trace
     from .matcher import match as match
     from .occupancy import OccupancyGrid as OccupancyGrid
+    from .occupancy import reference_scans as reference_scans
+    from .occupancy import stitch as stitch
     from .pose import Pose2D as Pose2D
     from .record import Record as Record
     from .reference import Reference as Reference
@@ -61,10 +65,14 @@ _HOMES = {
     "Trace": "matcher",
     "World": "simulator",
     "drive": "simulator",
+    "load_map": "map_file",
     "match": "matcher",
     "open_log": "io",
     "random_building": "simulator",
+    "reference_scans": "occupancy",
     "simulate": "simulator",
+    "stitch": "occupancy",
+    "write_map": "map_file",
     "write_tum": "io",
 }
 
