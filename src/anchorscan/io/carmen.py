@@ -61,6 +61,7 @@ class CarmenLog(LineLog):
         range_max: From this range on a reading is no return, metres, instead of the log's.
         pose_columns: What ``x y theta`` holds: the corrected pose of the laser, or, in a raw
             log, its pose by odometry.
+        T_base_laser: Where the laser sits on the robot, instead of what the log says.
 
     Raises:
         LogError: The log has no scan that can be read.
@@ -75,8 +76,10 @@ class CarmenLog(LineLog):
         field_of_view: float | None = None,
         range_max: float | None = None,
         pose_columns: PoseColumns = "corrected",
+        T_base_laser: Pose2D | None = None,
     ) -> None:
         self._field_of_view = field_of_view
+        self._T_base_laser = T_base_laser
         super().__init__(text, range_max=range_max, has_corrected_poses=pose_columns == "corrected")
 
     def _scan_lines(self, report: Report) -> Iterator[ScanLine | BadLine]:
@@ -100,9 +103,11 @@ class CarmenLog(LineLog):
     ) -> ScanLine | BadLine:
         try:
             if kind == b"ROBOTLASER1":
-                return parse_robot_laser(number, line, self._field_of_view)
+                parsed = parse_robot_laser(number, line, self._field_of_view)
+                return replace(parsed, mounting=self._T_base_laser)
             geometry = partial(parameters.geometry, kind, self._field_of_view)
-            return replace(parse_laser(number, line, geometry), mounting=parameters.mounting(kind))
+            mounting = self._T_base_laser or parameters.mounting(kind)
+            return replace(parse_laser(number, line, geometry), mounting=mounting)
         except ValueError as error:
             return BadLine(number, str(error))
 

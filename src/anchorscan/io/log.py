@@ -45,11 +45,13 @@ class Log(ABC):
         path: The file or folder.
         format: What it is, for messages: "CARMEN", "g2o", "rosbag2", ...
         count: Number of scan records where it is known without reading, for progress.
+        notes: What was guessed or is missing, a line each, to be shown to people.
         problem_count: Number of problems met by the latest iteration.
     """
 
     format: str = ""
     count: int | None = None
+    notes: tuple[str, ...] = ()
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -78,6 +80,10 @@ class Log(ABC):
         self.problem_count += 1
         if len(self._problems) < _KEPT_PROBLEMS:
             self._problems.append(Problem(line, reason))
+
+    def records(self, report: Report) -> Iterator[Record]:
+        """Read the recording for another log, which takes the reports."""
+        return self._read(report)
 
     @abstractmethod
     def _read(self, report: Report) -> Iterator[Record]:
