@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import math
 import multiprocessing
+import operator
 import os
 import struct
 import sys
@@ -248,7 +249,7 @@ class ReferenceSet:
         """The references in the order of their identifiers."""
         if self._listed is None:
             with self._lock:
-                self._listed = tuple(self._references.values())
+                self._listed = tuple(map(self._references.__getitem__, sorted(self._references)))
         return self._listed
 
     def __len__(self) -> int:
@@ -364,11 +365,14 @@ class ReferenceSet:
         Raises:
             ReferenceSetError: There is none, or the file cannot be written.
         """
+        identifier = operator.index(identifier)
         with self._lock:
-            self[identifier]
-            if self.path is not None:
+            if self.path is None:
+                self[identifier]
+            else:  # the file knows of those that others have added, too
                 self._writer().remove(identifier)
-            self._forget(identifier)
+            if identifier in self:
+                self._forget(identifier)
 
     def refresh(self) -> bool:
         """Take over what others have written to the file since it was read.
