@@ -1,0 +1,95 @@
+"""From fits to probabilities: how sure one scan can be, and when to say "not known".
+
+The paper thresholds e_m and leaves probabilities to the filter.  Nearly all confident wrong
+answers have a near-equal twin elsewhere: the same shape in another room.  So the probability
+that the best fit is right is a logistic function of four numbers:
+
+    log m       of the margin m of its score to the best fit at another place,
+    m           itself,
+    -log(1 - s) of its score s: how much of the scan the map explains,
+    through     the share of rays that pass through known surfaces.
+
+What is left goes to the other fits and to "somewhere else", in proportion to
+``exp(rivalry * score)``; "somewhere else" competes with a fixed score.
+
+The coefficients are fitted by ``anchorscan calibrate``; see the calibration page of the
+documentation for the logs, the rotation over buildings, and what it gave.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field
+
+from .verification import FEATURES, Fits
+
+__all__ = ["Decision", "DecisionSettings", "decide", "evidence"]
+
+_SCORE, _THROUGH = FEATURES.index("score"), FEATURES.index("through")
+_SMALLEST_MARGIN, _LARGEST_SCORE = 0.002, 0.995
+
+
+class DecisionSettings(BaseModel):
+    """Settings of the decision."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    constant: float = Field(1.3, description="of the logistic function")
+    log_margin: float = Field(1.8, description="weight of the logarithm of the margin")
+    margin: float = Field(-10.0, description="weight of the margin")
+    explained: float = Field(2.5, description="weight of -log(1 - score)")
+    through: float = Field(-6.5, description="weight of the share of rays that see through")
+    rivalry: float = Field(30.0, gt=0.0, description="of the fits for what the best leaves")
+    elsewhere: float = Field(0.8, description="score with which 'somewhere else' competes")
+    threshold: float = Field(0.9, gt=0.0, le=1.0, description="probability that is an answer")
+
+
+@dataclass(frozen=True, eq=False)
+class Decision:
+    """What the fits of one scan are worth.
+
+    Args:
+        probabilities: (F,) that each fit is right.
+        elsewhere: Probability that none is.
+        accepted: Whether the first is an answer.
+    """
+
+    probabilities: NDArray[np.float64]
+    elsewhere: float
+    accepted: bool
+
+
+def evidence(fits: Fits) -> NDArray[np.float64]:
+    """Return the (5,) numbers that speak for the best fit: 1 and those of the module's text.
+
+    A fit without a rival has a margin as if the rival scored half as much.
+    """
+    score = float(fits.features[0, _SCORE])
+    rival = float(fits.features[1, _SCORE]) if len(fits) > 1 else 0.5 * score
+    margin = max(score - rival, _SMALLEST_MARGIN)
+    explained = -math.log(1.0 - min(score, _LARGEST_SCORE))
+    through = float(fits.features[0, _THROUGH])
+    return np.array([1.0, math.log(margin), margin, explained, through])
+
+
+def decide(fits: Fits, settings: DecisionSettings) -> Decision:
+    """Say how likely each fit is, best first, and whether the best is an answer."""
+    if not len(fits):
+        return Decision(np.empty(0), 1.0, False)
+    weights = (
+        settings.constant,
+        settings.log_margin,
+        settings.margin,
+        settings.explained,
+        settings.through,
+    )
+    best = 1.0 / (1.0 + math.exp(-float(np.dot(evidence(fits), weights))))
+    rivals = np.exp(
+        settings.rivalry * (np.append(fits.features[1:, _SCORE], settings.elsewhere) - 1.0)
+    )
+    rest = (1.0 - best) * rivals / rivals.sum()
+    return Decision(np.append(best, rest[:-1]), float(rest[-1]), best >= settings.threshold)

@@ -1,0 +1,182 @@
+"""Section 5 taken further: how well a scan fits the map stitched from all references.
+
+The proposals of all relations go through finer and finer sieves: more readings, then only
+the best of each place, then a few steps of Gauss-Newton that move the pose until the
+readings lie on surfaces, then all readings and the rays that pass through known surfaces.
+What is left is a handful of *fits*, each with the numbers that the decision needs.
+
+The last numbers are the paper's e_m seen from the map: the share of readings that agree,
+and, beyond the paper, the shares that see through the map or that the map sees through.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field
+
+from ._jit import kernel
+from .angle_function import wrapped
+from .field import Tiles, cell_code, field_scores, normal_equations, passed_through, refined
+from .proposal import spread
+
+__all__ = ["FEATURES", "Fits", "VerificationSettings", "verify"]
+
+# What is told of every fit: shares of the readings.
+FEATURES = ("score", "near", "close", "free", "unknown", "through", "off")
+
+
+class VerificationSettings(BaseModel):
+    """Settings of the sieves between proposals and fits."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    second_readings: int = Field(48, ge=4, description="readings of the second check")
+    third_readings: int = Field(120, ge=4, description="readings of the third check")
+    third_poses: int = Field(80, ge=1, description="poses that reach the third check")
+    fits: int = Field(10, ge=1, description="distinct poses that are refined")
+    fit_readings: int = Field(120, ge=4, description="readings of the refinement")
+    iterations: int = Field(8, ge=0, description="steps of the refinement")
+    distinct_distance: float = Field(0.4, gt=0.0, description="poses nearer are one, metres")
+    distinct_turn: float = Field(
+        math.radians(15.0), gt=0.0, description="poses turned less are one, radians"
+    )
+    place_distance: float = Field(0.5, gt=0.0, description="fits nearer are one place, metres")
+    place_turn: float = Field(
+        math.radians(20.0), gt=0.0, description="fits turned less are one place, radians"
+    )
+    last_readings: int = Field(180, ge=4, description="readings of the last numbers")
+    rays: int = Field(90, ge=4, description="rays followed through the map")
+    through_margin: float = Field(0.3, gt=0.0, description="end of a ray that may touch, metres")
+
+
+@dataclass(frozen=True, eq=False)
+class Fits:
+    """Refined poses, best score first.
+
+    Args:
+        poses: (F, 3) T_set_laser, metres and radians.
+        features: (F, 7) of ``FEATURES``.
+        hessians: (F, 3, 3) of the refinement, per metre and radian squared.
+        residuals: (F,) mean squared distance of the readings that have a surface near, metres
+            squared.
+    """
+
+    poses: NDArray[np.float64]
+    features: NDArray[np.float64]
+    hessians: NDArray[np.float64]
+    residuals: NDArray[np.float64]
+
+    def __len__(self) -> int:
+        return len(self.poses)
+
+
+def verify(
+    poses: NDArray[np.float64],
+    points: NDArray[np.float64],
+    tiles: Tiles,
+    weights: NDArray[np.float32],
+    settings: VerificationSettings,
+) -> Fits:
+    """Sieve (P, 3) proposed poses and refine what is left.
+
+    Args:
+        poses: T_set_laser, metres and radians.
+        points: (N, 2) end points of the scan's returns, metres, scan frame.
+        tiles: The stitched map.
+        weights: (256,) score of a reading by the byte of its cell.
+        settings: Of the sieves.
+    """
+    sieves = (
+        settings.second_readings,
+        settings.third_readings,
+        settings.third_poses,
+        settings.fits,
+        settings.distinct_distance,
+        settings.distinct_turn,
+    )
+    chosen = _sieve(poses, points, tiles, weights, sieves)
+    steps = (settings.fit_readings, settings.iterations)
+    last = (settings.last_readings, settings.rays, settings.through_margin)
+    fits = _fit(chosen, points, tiles, weights, steps, last)
+    places = _distinct(fits[0], settings.place_distance, settings.place_turn, settings.fits)
+    return Fits(*(values[places] for values in fits))
+
+
+@kernel
+def _sieve(poses, points, tiles, weights, sieves):  # type: ignore[no-untyped-def]
+    """The best distinct poses by more and more readings."""
+    second, third, most, fits, distance, turn = sieves
+    scores = field_scores(poses, spread(points, second), tiles, weights)
+    order = np.argsort(-scores, kind="mergesort")[:most]
+    best = poses[order]
+    scores = field_scores(best, spread(points, third), tiles, weights)
+    best = best[np.argsort(-scores, kind="mergesort")]
+    return best[_distinct(best, distance, turn, fits)]
+
+
+@kernel
+def _distinct(poses, distance, turn, most):  # type: ignore[no-untyped-def]
+    """Indices of the first ``most`` poses that lie apart from all before them."""
+    chosen = np.empty(most, np.int64)
+    found = 0
+    for k in range(len(poses)):
+        new = found < most
+        for j in chosen[:found]:
+            if (
+                math.hypot(poses[k, 0] - poses[j, 0], poses[k, 1] - poses[j, 1]) < distance
+                and abs(wrapped(poses[k, 2] - poses[j, 2])) < turn
+            ):
+                new = False
+                break
+        if new:
+            chosen[found] = k
+            found += 1
+    return chosen[:found]
+
+
+@kernel
+def _features(pose, points, tiles, weights, rays, margin):  # type: ignore[no-untyped-def]
+    """The numbers of ``FEATURES`` for one pose."""
+    numbers = np.zeros(7)
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    for i in range(len(points)):
+        gx = (pose[0] + c * points[i, 0] - s * points[i, 1]) / tiles.resolution - tiles.column
+        gy = (pose[1] + s * points[i, 0] + c * points[i, 1]) / tiles.resolution - tiles.row
+        code = cell_code(tiles, int(gx), int(gy))
+        distance = (code & 63) * tiles.reach / 63.0
+        free = (code & 64) > 0
+        numbers[0] += weights[code]
+        numbers[1] += distance <= 0.1
+        numbers[2] += distance <= 0.2
+        if distance >= tiles.reach:
+            numbers[3 if free else 4] += 1
+        elif distance > 0.2 and free:
+            numbers[6] += 1
+    numbers /= max(len(points), 1)
+    numbers[5] = passed_through(pose, spread(points, rays), tiles, margin)
+    return numbers
+
+
+@kernel
+def _fit(poses, points, tiles, weights, steps, last):  # type: ignore[no-untyped-def]
+    """Refine every pose and take its numbers, best score first."""
+    count = len(poses)
+    moved = np.empty((count, 3))
+    features = np.empty((count, 7))
+    hessians = np.empty((count, 3, 3))
+    residuals = np.empty(count)
+    few = spread(points, steps[0])
+    many = spread(points, last[0])
+    for k in range(count):
+        moved[k] = refined(poses[k], few, tiles, steps[1])
+        moved[k, 2] = wrapped(moved[k, 2])
+        features[k] = _features(moved[k], many, tiles, weights, last[1], last[2])
+        hessian, _, squares, total = normal_equations(moved[k], few, tiles, 0.1)
+        hessians[k] = hessian
+        residuals[k] = squares / max(total, 1.0)
+    order = np.argsort(-features[:, 0], kind="mergesort")
+    return moved[order], features[order], hessians[order], residuals[order]
