@@ -78,6 +78,8 @@ def geometry_of(
     Raises:
         ValueError: Nothing is known and the number does not tell.
     """
+    if count < 2:
+        raise ValueError("the scan has no readings" if count < 1 else "the scan has one reading")
     if field_of_view is not None:
         return ScanGeometry(*spread(field_of_view, count), range_max=range_max)
     known = _RESOLUTIONS.get(count if count % 2 else count + 1)
@@ -104,7 +106,7 @@ def spread(field_of_view: float, count: int) -> tuple[float, float]:
     if not 0.0 < field_of_view < _FULL_TURN + _ROUND:
         raise ValueError(f"field_of_view must lie in (0, 2 pi] radians, not {field_of_view:g}")
     if count < 2:
-        raise ValueError("a single reading has no field of view")
+        raise ValueError("the scan has fewer than two readings")
     closed, opened = field_of_view / (count - 1), field_of_view / count
     is_full_turn = field_of_view > _FULL_TURN - _ROUND
     if is_full_turn or (_is_round(opened) and not _is_round(closed)):

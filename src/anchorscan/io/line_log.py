@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from abc import abstractmethod
 from collections import defaultdict
 from collections.abc import Iterator
@@ -37,17 +38,19 @@ class LineLog(Log):
         self._range_max = range_max
         self._has_corrected_poses = has_corrected_poses
         self._surveys: dict[bytes, tuple[int, Survey]] = {}
-        self.count = self._look_through()
+        self.count, first = self._look_through()
+        self.notes = tuple(self._say(first))
 
     @abstractmethod
     def _scan_lines(self, report: Report) -> Iterator[ScanLine | BadLine]:
         """Yield the scan lines in order; report malformed lines of other kinds."""
 
-    def _look_through(self) -> int:
+    def _look_through(self) -> tuple[int, LaserScan]:
         # A log writes all lines of a kind alike; the few that are shorter were cut off.
         surveys: dict[bytes, dict[int, Survey]] = defaultdict(lambda: defaultdict(Survey))
         first_problem: tuple[int, str] | None = None
-        count, usable = 0, False
+        count = 0
+        first: LaserScan | None = None
 
         def complain(number: int, reason: str) -> None:
             nonlocal first_problem
@@ -59,11 +62,10 @@ class LineLog(Log):
                 complain(line.number, line.reason)
                 continue
             surveys[line.kind][line.tail_length].add(line)
-            if not usable:
-                scan, reason = self._scan(line)
-                usable = scan is not None
+            if first is None:
+                first, reason = self._scan(line)
                 complain(line.number, reason)
-        if not usable:
+        if first is None:
             if first_problem is None:
                 raise LogError(f"holds no laser scan that a {self.format} reader knows", self.path)
             number, reason = first_problem
@@ -71,7 +73,18 @@ class LineLog(Log):
         for kind, by_length in surveys.items():
             length = max(by_length, key=lambda length: by_length[length].count)
             self._surveys[kind] = (length, by_length[length])
-        return count
+        return count, first
+
+    def _say(self, scan: LaserScan) -> Iterator[str]:
+        start, end = math.degrees(scan.angles[0]), math.degrees(scan.angles[-1])
+        yield f"{len(scan)} readings from {start:g} to {end:g} degrees, up to {scan.range_max:g} m"
+        for kind, (_, survey) in sorted(self._surveys.items()):
+            name = kind.decode()
+            poses = "poses" if self._has_corrected_poses else "odometry"
+            held = [poses] if survey.has_poses else []
+            held += ["odometry"] if survey.has_odometry and self._has_corrected_poses else []
+            held += ["times"] if survey.has_stamps else []
+            yield f"{survey.count} {name} lines with {', '.join(held) or 'scans alone'}"
 
     def _read(self, report: Report) -> Iterator[Record]:
         for index, line in enumerate(self._scan_lines(report)):

@@ -178,6 +178,8 @@ def _count(words: Sequence[bytes], at: int) -> int:
 
 def _numbers(words: Sequence[bytes], what: str) -> list[float]:
     try:
+        if b"_" in b"".join(words):  # which float() would take as a separator of thousands
+            raise ValueError
         return list(map(float, words))
     except ValueError:
         bad = next(word for word in words if not _is_number(word))
@@ -189,7 +191,7 @@ def _is_number(word: bytes) -> bool:
         float(word)
     except ValueError:
         return False
-    return True
+    return b"_" not in word
 
 
 def _pose(values: Sequence[float]) -> Pose2D | None:
