@@ -9,6 +9,7 @@ import tempfile
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -86,7 +87,7 @@ class SetAgainstDict(RuleBasedStateMachine):
     def note(self, identifiers: list[int], scans_: Iterable[LaserScan], *rest: object) -> None:
         assert identifiers == list(range(self.following, self.following + len(identifiers)))
         self.following += len(identifiers)
-        for identifier, place in zip(identifiers, zip(scans_, *rest), strict=True):  # type: ignore[call-overload]
+        for identifier, *place in zip(identifiers, scans_, *rest, strict=True):  # type: ignore[call-overload]
             self.model[identifier] = meaning(Reference(identifier, *place))
 
     @rule(scan=scans(), pose=poses, name=names)
@@ -359,13 +360,13 @@ class TestBuild:
         assert told[-1] == (600, len(places))
 
 
-class Interrupted(Exception):
+class StopReadingError(Exception):
     pass
 
 
 def until(records: list[Record], count: int) -> Iterator[Record]:
     yield from records[:count]
-    raise Interrupted
+    raise StopReadingError
 
 
 class TestResume:
@@ -379,7 +380,7 @@ class TestResume:
         stops = random.Random(1)
         path = tmp_path / "a.apr"
         for count in sorted(stops.sample(range(1500), 6)):
-            with pytest.raises(Interrupted):
+            with pytest.raises(StopReadingError):
                 ReferenceSet.build(until(self.RECORDS, count), keep_all=keep_all, path=path)
             if path.exists():
                 consumed = ReferenceSet.open(path).info().build.consumed
@@ -485,7 +486,7 @@ def _rooms() -> World:
         [(6.5, 6), (6.5, 4.1), (7.3, 4.1), (7.3, 6)],
         [(0, 3.7), (1.6, 3.7), (1.6, 4.4)],
     ]
-    pieces = [(*a, *b) for line in walls for a, b in zip(line, line[1:], strict=False)]
+    pieces = [(*a, *b) for line in walls for a, b in pairwise(line)]
     return World(walls=np.array(pieces, dtype=float), pillars=np.array([[7.4, 1.3, 0.25]]))
 
 

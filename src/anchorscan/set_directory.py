@@ -18,6 +18,7 @@ import shutil
 from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
+from tokenize import TokenError
 from typing import Any
 
 import numpy as np
@@ -45,6 +46,8 @@ _COLUMNS = (
     "range_min",
     "range_max",
 )
+# What numpy lets through when the header of an array is nonsense.
+_BAD_ARRAY = (OSError, ValueError, OverflowError, SyntaxError, TypeError, TokenError)
 _IDENTIFIER = re.compile(r"[0-9]{1,15}", re.ASCII)
 _LARGEST_DESCRIPTION = 1 << 22
 
@@ -93,7 +96,10 @@ def read_directory(path: Path) -> SetContent:
                 f"{path / _TABLE}: two references have the identifier {one.identifier}"
             )
     last = references[-1].identifier if references else -1
-    return SetContent(name, settings, max(following, last + 1), tuple(references))
+    try:
+        return SetContent(name, settings, max(following, last + 1), tuple(references))
+    except ReferenceSetError as error:
+        raise ReferenceSetError(f"{path / _DESCRIPTION}: {error}") from None
 
 
 def _write(path: Path, content: SetContent) -> None:
@@ -164,7 +170,8 @@ def _read_table(path: Path) -> Iterator[Reference]:
                 try:
                     yield _read_line(path, row)
                 except (ReferenceSetError, ScanError, ValueError) as error:
-                    raise ReferenceSetError(f"{path / _TABLE}:{table.line_num}: {error}") from None
+                    reason = " ".join(str(error).split())
+                    raise ReferenceSetError(f"{path / _TABLE}:{table.line_num}: {reason}") from None
         except csv.Error as error:
             raise ReferenceSetError(f"{path / _TABLE}:{table.line_num}: {error}") from None
 
@@ -191,12 +198,12 @@ def _read_pose(values: dict[str, str]) -> Pose2D | None:
 def _read_ranges(path: Path) -> NDArray[np.float32]:
     """Read (N,) ranges; a file that claims more than it holds costs no memory."""
     try:
-        mapped = np.load(path, mmap_mode="r", allow_pickle=False)
+        mapped = np.lib.format.open_memmap(path, mode="r")
     except FileNotFoundError:
         raise ReferenceSetError(f"there is no {path}") from None
-    except (OSError, ValueError, EOFError, OverflowError) as error:
+    except _BAD_ARRAY as error:
         raise ReferenceSetError(f"{path} cannot be read: {error}") from None
-    if not isinstance(mapped, np.ndarray) or mapped.ndim != 1 or mapped.dtype.kind not in "fiu":
+    if mapped.ndim != 1 or mapped.dtype.kind not in "fiu":
         raise ReferenceSetError(f"{path} does not hold ranges: one row of numbers")
     if len(mapped) > MOST_READINGS:
         raise ReferenceSetError(f"{path} holds more than {MOST_READINGS} readings")

@@ -373,6 +373,8 @@ def number(places: Iterable[Place], first: int) -> list[Reference]:
 def create_set(path: Path, content: SetContent) -> None:
     """Write a new file, which appears at ``path`` whole or not at all.
 
+    A process killed meanwhile leaves at most a hidden draft beside it, ``.NAME.*.new``.
+
     Raises:
         ReferenceSetError: Something is at ``path`` already, or it cannot be written.
     """
