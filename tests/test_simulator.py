@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from anchorscan import LaserScan, Pose2D
-from anchorscan.errors import AnchorscanError
+from anchorscan.errors import AnchorscanError, ScanError
 from anchorscan.sensor import SensorModel
 from anchorscan.simulator import (
     Door,
@@ -24,6 +24,7 @@ from anchorscan.simulator import (
     noisy_odometry,
     random_building,
     random_poses,
+    rasterise,
     remove_walls,
     scatter_people,
     simulate,
@@ -310,3 +311,44 @@ def test_impossible_buildings_are_refused() -> None:
         random_building(1, length=3.0)
     with pytest.raises(AnchorscanError, match="fits nowhere"):
         random_poses(square_room(), 1, 0, radius=3.0)
+
+
+def test_outside_of_a_drawn_building_is_unknown_and_its_rooms_are_free() -> None:
+    world = square_room()
+    grid = rasterise(world, 0.1)
+    inside, outside = grid.cells([[0.0, 0.0], [-2.3, 2.3]])
+    assert grid.is_free[tuple(inside)]
+    assert grid.data[tuple(outside)] == -1
+    # All that is free lies in the room; a world without an inside is free as a whole.
+    assert np.abs(grid.centres(np.argwhere(grid.is_free))).max() < 2.0
+    wall = rasterise(World(np.array([[0.0, 0.0, 1.0, 0.0]])), 0.1)
+    assert (wall.data >= 0).all()
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"field_of_view": 0.0}, "field of view"),
+        ({"field_of_view": 7.0}, "field of view"),
+        ({"resolution": 0.0}, "angular resolution"),
+        ({"resolution": math.nan}, "angular resolution"),
+        ({"range_min": 9.0, "range_max": 3.0}, "out of order"),
+        ({"range_max": math.inf}, "out of order"),
+        ({"noise": -1.0}, "must not be negative"),
+        ({"dropout": 1.1}, "dropout"),
+    ],
+)
+def test_impossible_sensors_are_refused(wrong: dict[str, float], message: str) -> None:
+    with pytest.raises(ScanError, match=message):
+        SensorModel(**wrong)
+
+
+def test_sensor_counts_its_readings_as_real_ones_do() -> None:
+    half = SensorModel(math.pi, math.radians(1.0))
+    full = SensorModel(2 * math.pi, math.radians(0.5))
+    assert (half.count, full.count) == (181, 720)
+    scan = full.measure(np.ones(720))
+    assert scan.is_full_turn
+    assert scan.angles[-1] == pytest.approx(math.pi - math.radians(0.5))
+    with pytest.raises(ScanError, match="181 readings need as many"):
+        half.measure(np.ones(180))

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +20,7 @@ from .scan import LaserScan
 __all__ = ["SensorModel"]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class SensorModel:
     """A planar laser scanner and its place on the robot.
 
@@ -69,30 +70,30 @@ class SensorModel:
         if not (self.noise >= 0.0 and self.relative_noise >= 0.0 and 0.0 <= self.dropout <= 1.0):
             raise ScanError("noise must not be negative and the dropout must lie in [0, 1]")
 
-    @property
+    @cached_property
     def _is_full_turn(self) -> bool:
         return self.field_of_view > 2.0 * math.pi - 0.5 * self.resolution
 
-    @property
+    @cached_property
     def count(self) -> int:
         """Readings in a scan."""
         steps = round(self.field_of_view / self.resolution)
         return steps if self._is_full_turn else steps + 1
 
-    @property
+    @cached_property
     def angle_increment(self) -> float:
         """Angle from a reading to the next, radians; negative when it sweeps clockwise."""
         steps = round(self.field_of_view / self.resolution)
         turn = 2.0 * math.pi if self._is_full_turn else self.field_of_view
         return math.copysign(turn / steps, -1.0 if self.clockwise != self.upside_down else 1.0)
 
-    @property
+    @cached_property
     def angle_min(self) -> float:
         """Direction of the first reading, radians, laser frame."""
         half = math.pi if self._is_full_turn else 0.5 * self.field_of_view
         return math.copysign(half, -self.angle_increment)
 
-    @property
+    @cached_property
     def sweep(self) -> tuple[float, float]:
         """Where it truly looks: angle of the first reading and step to the next, radians."""
         sign = -1.0 if self.mirrored else 1.0
@@ -115,9 +116,7 @@ class SensorModel:
             raise ScanError(f"{self.count} readings need as many distances: {distances.shape}")
         ranges = distances.astype(np.float64)
         if rng is not None and (self.noise > 0.0 or self.relative_noise > 0.0):
-            finite = np.where(np.isfinite(ranges), ranges, 0.0)
-            deviation = np.hypot(self.noise, self.relative_noise * finite)
-            ranges = ranges + deviation * rng.standard_normal(self.count)
+            ranges += self._deviation(ranges) * rng.standard_normal(self.count)
         too_near = ranges < self.range_min
         too_far = ranges > self.range_max
         ranges[too_near] = -math.inf
@@ -131,3 +130,9 @@ class SensorModel:
             self.range_min,
             self.range_max,
         )
+
+    def _deviation(self, distances: NDArray[np.float64]) -> NDArray[np.float64] | float:
+        if self.relative_noise == 0.0:
+            return self.noise
+        finite = np.where(np.isfinite(distances), distances, 0.0)
+        return np.asarray(np.hypot(self.noise, self.relative_noise * finite))
