@@ -21,7 +21,8 @@ ROOT = PACKAGE.parents[1]
 ORDER = (
     *("errors", "pose", "scan", "record", "reference", "protocol", "_jit"),
     *("angle_function", "segments", "anchors", "graph", "database", "alignment"),
-    *("field", "proposal", "verification", "evaluation", "hypothesis", "settings", "matcher"),
+    *("field", "proposal", "verification", "evaluation", "hypothesis", "decision", "settings"),
+    *("description", "pairwise", "stitched_map", "matcher"),
     *("set_file", "set_directory", "reference_set", "localizer"),
     *("sensor", "occupancy", "map_file", "simulator", "exhaustive_search"),
 )

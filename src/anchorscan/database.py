@@ -36,7 +36,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from ._jit import kernel
 from .graph import AnchorGraph
 
-__all__ = ["DatabaseSettings", "RelationshipDatabase", "Votes"]
+__all__ = ["DatabaseSettings", "RelationshipDatabase", "Votes", "quality"]
 
 # The length index: bins of 5 cm; edges beyond the last bin are in it, and still in order.
 _BIN_WIDTH = 0.05
@@ -62,7 +62,9 @@ class DatabaseSettings(BaseModel):
     count_once: bool = Field(
         False, description="count an edge at most once, not once for every correspondence"
     )
-    candidates: int = Field(5, ge=1, description="references that are aligned and evaluated")
+    candidates: int | None = Field(
+        None, ge=1, description="references that are followed further; null for all"
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -260,6 +262,17 @@ class RelationshipDatabase:
         )
 
 
+def quality(graph: AnchorGraph, other: AnchorGraph, settings: DatabaseSettings) -> float:
+    """Compute q_m of two graphs without a database (section 4.1)."""
+    pairs = float(len(graph)) * len(other)
+    if not pairs:
+        return 0.0
+    count = _count_pair(
+        graph.lengths, other.lengths, settings.length_tolerance, settings.count_once
+    )
+    return float(count) ** 2 / pairs
+
+
 def _bins(lengths: NDArray[np.float32]) -> NDArray[np.int64]:
     """(E,) bin of each length, by the very expression that the kernel uses."""
     return np.minimum(lengths.astype(np.float64) / _BIN_WIDTH, _BINS - 1).astype(np.int64)
@@ -352,6 +365,28 @@ def _count(query, lengths, slots, starts, tolerance, counts, cursors):  # type: 
             at += 1
         if at >= len(lengths):
             break
+
+
+@kernel
+def _count_pair(query, lengths, tolerance, once):  # type: ignore[no-untyped-def]
+    """Corresponding edges of two graphs, both in order of length."""
+    count = 0
+    low = 0
+    high = 0
+    free = 0
+    for length in lengths:
+        # As the database keeps it.
+        at = np.float64(np.float32(length))
+        while high < len(query) and query[high] - at <= tolerance:
+            high += 1
+        while low < len(query) and at - query[low] > tolerance:
+            low += 1
+        if not once:
+            count += high - low
+        elif max(free, low) < high:
+            free = max(free, low) + 1
+            count += 1
+    return count
 
 
 @kernel

@@ -27,7 +27,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from .verification import FEATURES, Fits
 
-__all__ = ["Decision", "DecisionSettings", "decide", "evidence"]
+__all__ = ["Decision", "DecisionSettings", "covariance", "decide", "evidence"]
 
 _SCORE, _THROUGH = FEATURES.index("score"), FEATURES.index("through")
 _SMALLEST_MARGIN, _LARGEST_SCORE = 0.002, 0.995
@@ -46,6 +46,15 @@ class DecisionSettings(BaseModel):
     rivalry: float = Field(30.0, gt=0.0, description="of the fits for what the best leaves")
     elsewhere: float = Field(0.8, description="score with which 'somewhere else' competes")
     threshold: float = Field(0.9, gt=0.0, le=1.0, description="probability that is an answer")
+    range_deviation: float = Field(
+        0.03, gt=0.0, description="least standard deviation of a reading, metres"
+    )
+    readings_alike: float = Field(
+        10.0, ge=1.0, description="readings that err together: so many count as one"
+    )
+    widest_deviation: float = Field(
+        5.0, gt=0.0, description="standard deviation where nothing holds the pose, metres, radians"
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,6 +83,18 @@ def evidence(fits: Fits) -> NDArray[np.float64]:
     explained = -math.log(1.0 - min(score, _LARGEST_SCORE))
     through = float(fits.features[0, _THROUGH])
     return np.array([1.0, math.log(margin), margin, explained, through])
+
+
+def covariance(fits: Fits, settings: DecisionSettings) -> NDArray[np.float64]:
+    """Return (F, 3, 3) covariances of x, y, theta in the set's frame.
+
+    The inverse of the Hessian of the refinement, scaled by the residuals that were observed:
+    wide along a plain corridor, where no reading holds the pose.
+    """
+    variance = np.maximum(fits.residuals, settings.range_deviation**2) * settings.readings_alike
+    information = fits.hessians / variance[:, np.newaxis, np.newaxis]
+    floor = np.eye(3) / settings.widest_deviation**2
+    return np.asarray(np.linalg.inv(information + floor))
 
 
 def decide(fits: Fits, settings: DecisionSettings) -> Decision:

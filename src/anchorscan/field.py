@@ -317,8 +317,7 @@ def _derive(rows, columns, table, evidence, codes, limits):  # type: ignore[no-u
                 for j in range(max(0, v - halo), min(_SIDE, v + halo + 1)):
                     for i in range(max(0, u - halo), min(_SIDE, u + halo + 1)):
                         off = (i + 0.5 - x) ** 2 + (j + 0.5 - y) ** 2
-                        if off < distance[j, i]:
-                            distance[j, i] = off
+                        distance[j, i] = min(distance[j, i], off)
         for j in range(_SIDE):
             for i in range(_SIDE):
                 code = int(min(math.sqrt(distance[j, i]) * resolution / reach, 1.0) * _FAR)

@@ -1,12 +1,4 @@
-"""The algorithm on one screen: scan in, hypotheses out (sections 2 to 5).
-
-Hypotheses are ordered by e_m, as in the paper's experiment; equals by support, then by q_m,
-then by the reference's identifier, so that the order of the references does not matter.
-
-The paper says nothing of a scan whose graph corresponds to no reference's.  Since every scan
-that saw anything is to have an answer, it is then evaluated as if it had been taken where the
-candidate references were; that may be right, and e_m says whether it is.
-"""
+"""The algorithm on one screen: scan in, hypotheses out (sections 2 to 5)."""
 
 from __future__ import annotations
 
@@ -17,77 +9,21 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
-from .alignment import Alignment, align
-from .anchors import (
-    AnchorPoints,
-    VirtualEdges,
-    angle_anchors,
-    gather,
-    jump_edge_anchors,
-    virtual_edges,
-)
-from .angle_function import AngleFunction, angle_function
-from .database import RelationshipDatabase, Votes
-from .evaluation import (
-    Evaluation,
-    Outline,
-    evaluate,
-    evaluate_all,
-    outline,
-    probability,
-    stack_outlines,
-)
-from .graph import AnchorGraph, anchor_graph, stack
+from .decision import Decision
+from .description import Description, describe
+from .evaluation import Evaluation, evaluate
 from .hypothesis import Hypothesis
+from .pairwise import Known, Pairwise, PairwiseSearch
 from .pose import Pose2D
 from .reference import Reference
 from .scan import LaserScan
-from .segments import Segments, segments
 from .settings import Settings
+from .stitched_map import MapSearch, StitchedMap
 
-__all__ = ["Candidates", "Description", "Found", "Matcher", "Trace", "describe", "match"]
+__all__ = ["Candidates", "Matcher", "Trace", "match"]
 
 Candidates = int | Literal["all"] | None
-
-
-@dataclass(frozen=True, eq=False)
-class Description:
-    """All that is derived from one scan by itself.
-
-    Args:
-        angles: Angle function (section 2).
-        surfaces: Large connected surfaces (section 3).
-        edges: Walls behind the virtual edges, per main angle (section 3).
-        anchors: Anchor points (section 3).
-        graph: Anchor graph (section 4).
-        outline: What it saw, for the evaluation (section 5).
-    """
-
-    angles: AngleFunction
-    surfaces: Segments
-    edges: tuple[VirtualEdges, ...]
-    anchors: AnchorPoints
-    graph: AnchorGraph
-    outline: Outline
-
-
-@dataclass(frozen=True, eq=False)
-class Found:
-    """Poses to be evaluated.
-
-    Args:
-        candidates: (N,) candidate that each is with.
-        poses: (N, 3) ``T_reference_scan`` as x, y, theta, metres and radians.
-        support: (N,) hypotheses behind each.
-        scatter: (N, 3, 3) covariance of x, y, theta among those.
-    """
-
-    candidates: NDArray[np.int64]
-    poses: NDArray[np.float64]
-    support: NDArray[np.int64]
-    scatter: NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,25 +32,37 @@ class Trace:
 
     Args:
         scan: The scan.
-        description: What was derived from it.
-        votes: Of the candidate references, best first (section 4.1).
-        candidates: The candidate references, in the order of the votes.
-        alignment: Alignment with all candidates (section 4.2).
-        found: The alignments that were evaluated.
-        evaluations: (N,) e_m of each (section 5).
+        description: What was derived from it (sections 2 to 4).
+        pairwise: The search against single references, where that was the method.
+        in_map: The search in the stitched map, where that was the method.
+        references: Those that the hypotheses name.
         hypotheses: The answer, best first.
         settings: The settings of the run.
     """
 
     scan: LaserScan
     description: Description
-    votes: Votes
-    candidates: tuple[Reference, ...]
-    alignment: Alignment
-    found: Found
-    evaluations: NDArray[np.float64]
+    pairwise: PairwiseSearch | None
+    in_map: MapSearch | None
+    references: tuple[Reference, ...]
     hypotheses: tuple[Hypothesis, ...]
     settings: Settings
+
+    @property
+    def decision(self) -> Decision | None:
+        """What the fits in the map are worth, where that was the method."""
+        return None if self.in_map is None else self.in_map.decision
+
+    def reference(self, identifier: int) -> Reference:
+        """Return a reference that a hypothesis names.
+
+        Raises:
+            ValueError: No hypothesis does.
+        """
+        for reference in self.references:
+            if reference.identifier == identifier:
+                return reference
+        raise ValueError(f"no hypothesis of this scan names reference {identifier}")
 
     def evaluation(self, hypothesis: Hypothesis) -> Evaluation:
         """Evaluate one of the hypotheses once more and keep its synthetic scan.
@@ -122,28 +70,20 @@ class Trace:
         Raises:
             ValueError: The hypothesis is not one of this trace.
         """
-        for reference in self.candidates:
-            if reference.identifier == hypothesis.reference:
-                return evaluate(
-                    self.scan,
-                    reference.scan,
-                    hypothesis.pose_in_reference,
-                    self.settings.evaluation,
-                    self.settings.anchors.angle_function,
-                )
-        raise ValueError(f"reference {hypothesis.reference} is no candidate of this scan")
-
-
-@dataclass(frozen=True, eq=False)
-class _Known:
-    reference: Reference
-    graph: AnchorGraph
-    outline: Outline
+        return evaluate(
+            self.scan,
+            self.reference(hypothesis.reference).scan,
+            hypothesis.pose_in_reference,
+            self.settings.evaluation,
+            self.settings.anchors.angle_function,
+        )
 
 
 class Matcher:
     """Finds the poses from which a scan may have been taken, among reference scans.
 
+    References with a pose are searched as one stitched map, unless the settings ask for the
+    method of the paper, which takes references one by one; so are those without a pose.
     Searching is safe from many threads while one of them adds and removes.
 
     Args:
@@ -160,9 +100,10 @@ class Matcher:
         self.settings = settings or Settings.preset("default")
         known = [self._know(reference) for reference in references]
         self._known = {each.reference.identifier: each for each in known}
-        self._database = RelationshipDatabase(
-            self.settings.database, ((each.reference.identifier, each.graph) for each in known)
-        )
+        if len(self._known) < len(known):
+            raise ValueError("two references have the same identifier")
+        self._singles = Pairwise(self.settings, [each for each in known if not self._fits(each)])
+        self._map = StitchedMap(self.settings, [each for each in known if self._fits(each)])
         self._writing = threading.Lock()
 
     def __len__(self) -> int:
@@ -178,8 +119,8 @@ class Matcher:
 
         Args:
             scan: The scan.
-            candidates: References to align and evaluate: their number, ``"all"``, or None
-                for the number in the settings.
+            candidates: References whose relations are followed: their number, ``"all"``, or
+                None for the number in the settings.
 
         Returns:
             Hypotheses, best first; none only for a scan without any return, or when there
@@ -189,27 +130,20 @@ class Matcher:
 
     def explain(self, scan: LaserScan, candidates: Candidates = None) -> Trace:
         """Do what ``locate`` does and return every intermediate value."""
-        settings = self.settings
-        description = describe(scan, settings)
-        votes = self._database.votes(description.graph, self._most(candidates))
-        known = [self._known[identifier] for identifier in votes.references.tolist()]
-        references = tuple(each.reference for each in known)
-        alignment = align(
-            description.graph, stack([each.graph for each in known]), settings.alignment
+        description = describe(scan, self.settings)
+        most = self._most(candidates)
+        seen = len(description.angles.ranges) > 0
+        singles = self._singles.search(description, most) if seen and self._singles else None
+        in_map = self._map.search(description, most) if seen and self._map else None
+        searches = [search for search in (in_map, singles) if search is not None]
+        hypotheses = [hypothesis for search in searches for hypothesis in search.hypotheses]
+        if len(searches) > 1:
+            hypotheses.sort(key=lambda each: -each.probability)
+        references = tuple(
+            {each.reference: self._known[each.reference].reference for each in hypotheses}.values()
         )
-        found = _found(alignment, len(known))
-        e_m = evaluate_all(
-            description.outline,
-            stack_outlines([each.outline for each in known]),
-            found.candidates,
-            found.poses,
-            settings.evaluation,
-        )
-        hypotheses = _hypotheses(references, votes, found, e_m, settings)
-        if not len(description.outline.rows):
-            hypotheses = ()
         return Trace(
-            scan, description, votes, references, alignment, found, e_m, hypotheses, settings
+            scan, description, singles, in_map, references, tuple(hypotheses), self.settings
         )
 
     def add(self, reference: Reference) -> None:
@@ -223,7 +157,7 @@ class Matcher:
             if reference.identifier in self._known:
                 raise ValueError(f"there is a reference {reference.identifier} already")
             self._known[reference.identifier] = known
-            self._database.add(reference.identifier, known.graph)
+            (self._map if self._fits(known) else self._singles).add(known)
 
     def remove(self, identifier: int) -> None:
         """Remove a reference.
@@ -232,7 +166,8 @@ class Matcher:
             KeyError: There is no such reference.
         """
         with self._writing:
-            self._database.remove(identifier)
+            known = self._known[identifier]
+            (self._map if self._fits(known) else self._singles).remove(identifier)
             del self._known[identifier]
 
     def prepare(self) -> None:
@@ -243,9 +178,11 @@ class Matcher:
             for hypothesis in (trace := places.explain(_ROOM, candidates)).hypotheses[:1]:
                 trace.evaluation(hypothesis)
 
-    def _know(self, reference: Reference) -> _Known:
-        description = describe(reference.scan, self.settings)
-        return _Known(reference, description.graph, description.outline)
+    def _know(self, reference: Reference) -> Known:
+        return Known(reference, describe(reference.scan, self.settings))
+
+    def _fits(self, known: Known) -> bool:
+        return self.settings.method == "map" and known.reference.pose is not None
 
     def _most(self, candidates: Candidates) -> int | None:
         if candidates is None:
@@ -264,100 +201,10 @@ def match(
         settings: Of all stages; the default preset if None.
 
     Returns:
-        Hypotheses, best first, with ``pose_in_reference`` and no pose in a set.
+        Hypotheses, best first; ``pose`` and ``pose_in_reference`` are both
+        ``T_reference_scan``.
     """
-    return Matcher((Reference(0, reference),), settings).locate(scan)
-
-
-def describe(scan: LaserScan, settings: Settings) -> Description:
-    """Derive from one scan all that the matching needs (sections 2 to 4)."""
-    angles = angle_function(scan, settings.anchors.angle_function)
-    surfaces = segments(angles, settings.anchors.segments)
-    edges = virtual_edges(angles, settings.anchors)
-    anchors = gather(
-        jump_edge_anchors(angles, surfaces, settings.anchors),
-        angle_anchors(angles, surfaces, settings.anchors),
-        edges,
-    )
-    graph = anchor_graph(anchors, settings.graph)
-    return Description(angles, surfaces, tuple(edges), anchors, graph, outline(scan, angles))
-
-
-def _found(alignment: Alignment, candidates: int) -> Found:
-    """Return the poses to evaluate: the alignments, or else the places of the candidates."""
-    if len(alignment):
-        return Found(alignment.candidates, alignment.poses, alignment.support, alignment.scatter)
-    # Nothing tells where around the reference the scan was taken: a metre and half a turn.
-    unknown = np.diag([1.0, 1.0, 0.25 * np.pi**2])
-    return Found(
-        np.arange(candidates),
-        np.zeros((candidates, 3)),
-        np.zeros(candidates, np.int64),
-        np.repeat(unknown[np.newaxis], candidates, axis=0),
-    )
-
-
-def _hypotheses(
-    references: tuple[Reference, ...],
-    votes: Votes,
-    found: Found,
-    e_m: NDArray[np.float64],
-    settings: Settings,
-) -> tuple[Hypothesis, ...]:
-    """Order the evaluated alignments and say what each is worth."""
-    order = np.lexsort((found.candidates, -found.support, -e_m))[: settings.acceptance.hypotheses]
-    e_m = e_m[order]
-    worth = probability(e_m, settings.acceptance)
-    covariances = found.scatter[order] + np.diag(
-        np.square(
-            (
-                settings.alignment.position_deviation,
-                settings.alignment.position_deviation,
-                settings.alignment.heading_deviation,
-            )
-        )
-    )
-    return tuple(
-        _hypothesis(
-            references[c], Pose2D(*pose), covariance, e, float(votes.quality[c]), p, settings
-        )
-        for c, pose, covariance, e, p in zip(
-            found.candidates[order].tolist(),
-            found.poses[order].tolist(),
-            covariances,
-            e_m.tolist(),
-            worth.tolist(),
-            strict=True,
-        )
-    )
-
-
-def _hypothesis(
-    reference: Reference,
-    T_reference_scan: Pose2D,
-    covariance: NDArray[np.float64],
-    e_m: float,
-    quality: float,
-    worth: float,
-    settings: Settings,
-) -> Hypothesis:
-    pose = None
-    if reference.pose is not None:
-        pose = reference.pose @ T_reference_scan
-        c, s = math.cos(reference.pose.theta), math.sin(reference.pose.theta)
-        turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-        covariance = turn @ covariance @ turn.T
-    return Hypothesis(
-        reference=reference.identifier,
-        pose_in_reference=T_reference_scan,
-        pose=pose,
-        covariance=covariance,
-        evaluation=e_m,
-        quality=quality,
-        score=e_m,
-        probability=worth,
-        accepted=e_m >= settings.acceptance.threshold,
-    )
+    return Matcher((Reference(0, reference, Pose2D()),), settings).locate(scan)
 
 
 # A room with a door and a pillar: enough for every kernel to have something to do.

@@ -68,7 +68,7 @@ class ProposalSettings(BaseModel):
     lone_heading_tolerance: float = Field(
         math.radians(25.0), gt=0.0, description="lone anchor to main angles, radians"
     )
-    enough: int = Field(1 << 20, ge=0, description="with so many from edges no lone anchors")
+    enough: int = Field(300, ge=0, description="with so many from edges no lone anchors")
     readings: int = Field(12, ge=4, description="readings of the first check")
     most: int = Field(400, ge=1, description="proposals that pass the first check")
     landmark_cell: float = Field(0.2, gt=0.0, description="anchors merged within, metres")
@@ -343,9 +343,7 @@ def _first_check(table, heading, x, y, tiles):  # type: ignore[no-untyped-def]
     count = table.shape[1]
     total = 0
     for i in range(count):
-        total += coarse_score(
-            tiles, int(gx + table[heading, i, 0]), int(gy + table[heading, i, 1])
-        )
+        total += coarse_score(tiles, int(gx + table[heading, i, 0]), int(gy + table[heading, i, 1]))
         # Half of the readings without a quarter of what they could reach: not here.
         if 2 * (i + 1) == count and total < 16 * count:
             return -1
@@ -381,7 +379,7 @@ def _edge_proposals(query, known, limits, out):  # type: ignore[no-untyped-def]
                 _to_units(bearing),
                 _to_units(directions[a] - bearing),
                 _to_units(directions[b] - bearing),
-                _fold(_to_units(bearing - main)) if main == main else _UNKNOWN,
+                _fold(_to_units(bearing - main)) if math.isfinite(main) else _UNKNOWN,
             )
             group = kinds[a] * _KINDS + kinds[b]
             for block in range(len(known.edge_starts)):
@@ -431,7 +429,7 @@ def _lone_proposals(query, known, limits, out, found):  # type: ignore[no-untype
     positions, kinds, directions, main = query
     for i in range(len(kinds)):
         direction = _to_units(directions[i])
-        askew = _fold(_to_units(directions[i] - main)) if main == main else _UNKNOWN
+        askew = _fold(_to_units(directions[i] - main)) if math.isfinite(main) else _UNKNOWN
         anchor = (positions[i, 0], positions[i, 1])
         for block in range(len(known.starts)):
             for m in range(known.starts[block, kinds[i]], known.starts[block, kinds[i] + 1]):

@@ -8,13 +8,15 @@ and the value is the one that did best on the logs named in the module that uses
 from __future__ import annotations
 
 import difflib
+import math
 import types
 from collections.abc import Mapping
-from typing import Any, get_args
+from typing import Any, Literal, get_args
 
 from pydantic import (
     BaseModel,
     ConfigDict,
+    Field,
     ModelWrapValidatorHandler,
     ValidationError,
     model_validator,
@@ -23,15 +25,52 @@ from pydantic import (
 from .alignment import AlignmentSettings
 from .anchors import AnchorSettings
 from .database import DatabaseSettings
+from .decision import DecisionSettings
 from .errors import SettingsError
 from .evaluation import AcceptanceSettings, EvaluationSettings
+from .field import FieldSettings
 from .graph import GraphSettings
+from .proposal import ProposalSettings
+from .verification import VerificationSettings
 
 __all__ = ["PRESETS", "Settings"]
 
+# False anchor points cost little where every proposal is checked, so extraction is generous.
+_MAP: Mapping[str, Any] = {
+    "anchors": {
+        "angle_function": {"baseline": 0.3, "fitted": True},
+        "segments": {"smallest_extent": 0.2},
+        "smallest_rim_angle": math.radians(8.0),
+        "smallest_turn": math.radians(25.0),
+        "arm": 0.3,
+        "shortest_arm": 0.12,
+        "smallest_wall": 0.5,
+        "most_walls": 6,
+        "facing": True,
+        "most_main_angles": 1,
+    },
+}
+
 # What a preset says differently from the defaults of the sections.
 PRESETS: Mapping[str, Mapping[str, Any]] = types.MappingProxyType(
-    {"default": {}, "paper": {}, "thorough": {"database": {"candidates": 30}}}
+    {
+        "paper": {"method": "references", "database": {"candidates": 5}},
+        "default": _MAP,
+        "thorough": {
+            **_MAP,
+            "proposal": {"enough": 1 << 16, "most": 600},
+            "verification": {
+                "second_readings": 60,
+                "third_readings": 180,
+                "third_poses": 200,
+                "fits": 20,
+                "fit_readings": 360,
+                "iterations": 12,
+                "last_readings": 360,
+                "rays": 180,
+            },
+        },
+    }
 )
 
 
@@ -40,12 +79,19 @@ class Settings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
+    method: Literal["map", "references"] = Field(
+        "map", description="search all references as one map, or one by one as the paper does"
+    )
     anchors: AnchorSettings = AnchorSettings()
     graph: GraphSettings = GraphSettings()
     database: DatabaseSettings = DatabaseSettings()
     alignment: AlignmentSettings = AlignmentSettings()
     evaluation: EvaluationSettings = EvaluationSettings()
     acceptance: AcceptanceSettings = AcceptanceSettings()
+    field: FieldSettings = FieldSettings()
+    proposal: ProposalSettings = ProposalSettings()
+    verification: VerificationSettings = VerificationSettings()
+    decision: DecisionSettings = DecisionSettings()
 
     @classmethod
     def preset(cls, name: str = "default") -> Settings:
@@ -65,7 +111,10 @@ class Settings(BaseModel):
         Raises:
             SettingsError: The text is no JSON, a name is unknown or a value impossible.
         """
-        return cls.model_validate_json(text)
+        try:
+            return cls.model_validate_json(text)
+        except ValidationError as error:  # the text is no JSON; the rest is explained below
+            raise SettingsError(_explanation(cls, error)) from None
 
     def to_json(self) -> str:
         """Write all settings as JSON."""

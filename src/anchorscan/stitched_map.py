@@ -8,96 +8,84 @@ that an answer can name the reference scan that it stands for.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict
 
 from ._jit import kernel
-from .anchors import AnchorPoints
 from .angle_function import wrapped
-from .field import FieldSettings, LikelihoodField
+from .database import RelationshipDatabase, Votes, quality
+from .decision import Decision, covariance, decide
+from .description import Description
+from .evaluation import evaluate_all, stack_outlines
+from .field import LikelihoodField
+from .hypothesis import Hypothesis
+from .pairwise import Known
 from .pose import Pose2D
-from .proposal import Landmarks, Proposals, ProposalSettings, joined, landmarks, proposals
+from .proposal import Landmarks, Proposals, joined, landmarks, proposals
 from .scan import LaserScan
-from .verification import Fits, VerificationSettings, verify
+from .settings import Settings
+from .verification import Fits, verify
 
-__all__ = ["MapSettings", "Placed", "Search", "StitchedMap"]
-
-
-class MapSettings(BaseModel):
-    """Settings of the search in the map stitched from all references."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    proposal: ProposalSettings = ProposalSettings()
-    field: FieldSettings = FieldSettings()
-    verification: VerificationSettings = VerificationSettings()
+__all__ = ["MapSearch", "StitchedMap"]
 
 
 @dataclass(frozen=True, eq=False)
-class Placed:
-    """A reference in the map.
+class MapSearch:
+    """What a search in the stitched map came through.
 
     Args:
-        identifier: Of the reference.
-        scan: Its laser scan.
-        pose: ``T_set_laser``.
-        anchors: Its anchor points, scan frame.
-        relations: Its own landmarks: a block for a search among few references.
-    """
-
-    identifier: int
-    scan: LaserScan
-    pose: Pose2D
-    anchors: AnchorPoints
-    relations: Landmarks
-
-
-@dataclass(frozen=True, eq=False)
-class Search:
-    """What a search came through.
-
-    Args:
+        votes: Of the candidate references, best first; None where all may propose.
         proposals: Alignments that passed the first check.
         fits: What is left after all sieves, best score first.
+        decision: What they are worth.
+        hypotheses: Best first.
     """
 
+    votes: Votes | None
     proposals: Proposals
     fits: Fits
+    decision: Decision
+    hypotheses: tuple[Hypothesis, ...]
 
 
 class StitchedMap:
-    """References in a common frame, as one map; one writer, many readers.
+    """References in a common frame, searched as one map; one writer, many readers.
 
     Args:
-        settings: Of the search.
-        references: Identifier, scan, pose ``T_set_laser`` and anchor points of each.
+        settings: Of all stages.
+        known: References to begin with, all with a pose.
     """
 
-    def __init__(
-        self,
-        settings: MapSettings,
-        references: Iterable[tuple[int, LaserScan, Pose2D, AnchorPoints]] = (),
-    ) -> None:
+    def __init__(self, settings: Settings, known: Iterable[Known] = ()) -> None:
+        begin = list(known)
         self._settings = settings
         self._weights = settings.field.weights()
-        self._placed = {entry[0]: self._place(*entry) for entry in references}
-        self._field = LikelihoodField(
-            settings.field, ((each.scan, each.pose) for each in self._placed.values())
+        self._known = {each.reference.identifier: each for each in begin}
+        self._relations = {identifier: self._relate(k) for identifier, k in self._known.items()}
+        self._database = RelationshipDatabase(
+            settings.database,
+            ((each.reference.identifier, each.description.graph) for each in begin),
         )
+        self._field = LikelihoodField(settings.field, (_placed(each) for each in begin))
         self._changed()
 
     def __len__(self) -> int:
-        return len(self._placed)
+        return len(self._known)
 
-    def add(self, identifier: int, scan: LaserScan, pose: Pose2D, anchors: AnchorPoints) -> None:
-        """Add a reference."""
-        placed = self._place(identifier, scan, pose, anchors)
-        self._field.add(scan, pose)
-        self._placed = {**self._placed, identifier: placed}
+    def add(self, known: Known) -> None:
+        """Add a reference that has a pose.
+
+        Raises:
+            ValueError: The identifier is in use.
+        """
+        identifier = known.reference.identifier
+        self._database.add(identifier, known.description.graph)
+        self._field.add(*_placed(known))
+        self._relations[identifier] = self._relate(known)
+        self._known[identifier] = known
         self._changed()
 
     def remove(self, identifier: int) -> None:
@@ -106,89 +94,120 @@ class StitchedMap:
         Raises:
             KeyError: There is no such reference.
         """
-        placed = self._placed[identifier]
-        self._field.remove(placed.scan, placed.pose)
-        self._placed = {key: value for key, value in self._placed.items() if key != identifier}
+        known = self._known[identifier]
+        self._database.remove(identifier)
+        self._field.remove(*_placed(known))
+        del self._relations[identifier]
+        del self._known[identifier]
         self._changed()
 
-    def search(
-        self,
-        anchors: AnchorPoints,
-        points: NDArray[np.float64],
-        among: Sequence[int] | None = None,
-    ) -> Search:
-        """Find poses from which a scan may have been taken.
+    def search(self, description: Description, most: int | None) -> MapSearch:
+        """Let relations propose poses, sieve and refine them, and decide.
 
         Args:
-            anchors: Of the scan.
-            points: (N, 2) end points of its returns, metres, scan frame.
-            among: References whose relations may propose; None for all.
+            description: Of the scan.
+            most: How many references, those of the highest quality, may propose; None for all.
         """
         settings = self._settings
         tiles = self._field.tiles
-        known = self._all() if among is None else self._some(among)
-        proposed = proposals(anchors, points, known, tiles, settings.proposal)
+        points = description.angles.points
+        votes = None if most is None else self._database.votes(description.graph, most)
+        known = self._all() if votes is None else self._some(votes.references)
+        proposed = proposals(description.anchors, points, known, tiles, settings.proposal)
         if not len(proposed.poses):
-            proposed = self._standing(among)
+            proposed = self._standing()
         fits = verify(proposed.poses, points, tiles, self._weights, settings.verification)
-        return Search(proposed, fits)
+        decision = decide(fits, settings.decision)
+        hypotheses = self._hypotheses(description, fits, decision)
+        return MapSearch(votes, proposed, fits, decision, hypotheses)
 
-    def nearest(self, poses: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Return the reference taken nearest to each of (N, 3) poses.
-
-        A radian of turn counts as a metre; of equals the one with the lowest identifier.
-        """
-        return self._identifiers[_nearest(self._poses, poses)]
+    def _hypotheses(
+        self, description: Description, fits: Fits, decision: Decision
+    ) -> tuple[Hypothesis, ...]:
+        """Name for each of the best fits the reference taken nearest, and compare with it."""
+        settings = self._settings
+        count = min(len(fits), settings.acceptance.hypotheses)
+        nearest, T_reference_scan = _stand_for(self._poses, fits.poses[:count])
+        known = [self._known[identifier] for identifier in self._identifiers[nearest].tolist()]
+        e_m = evaluate_all(
+            description.outline,
+            stack_outlines([each.description.outline for each in known]),
+            np.arange(count),
+            T_reference_scan,
+            settings.evaluation,
+        )
+        covariances = covariance(fits, settings.decision)
+        return tuple(
+            Hypothesis(
+                reference=each.reference.identifier,
+                pose_in_reference=Pose2D(*T_reference_scan[n].tolist()),
+                pose=Pose2D(*fits.poses[n].tolist()),
+                covariance=covariances[n],
+                evaluation=float(e_m[n]),
+                quality=quality(description.graph, each.description.graph, settings.database),
+                score=float(fits.features[n, 0]),
+                probability=float(decision.probabilities[n]),
+                accepted=decision.accepted and n == 0,
+            )
+            for n, each in enumerate(known)
+        )
 
     def _changed(self) -> None:
-        placed = sorted(self._placed.values(), key=lambda each: each.identifier)
-        self._identifiers = np.array([each.identifier for each in placed], np.int64)
-        self._poses = np.array(
-            [(each.pose.x, each.pose.y, each.pose.theta) for each in placed]
-        ).reshape(-1, 3)
+        identifiers = sorted(self._known)
+        self._identifiers = np.array(identifiers, np.int64)
+        poses = [_placed(self._known[identifier])[1].to_array() for identifier in identifiers]
+        self._poses = np.array(poses).reshape(-1, 3)
         self._landmarks: Landmarks | None = None
 
-    def _place(
-        self, identifier: int, scan: LaserScan, pose: Pose2D, anchors: AnchorPoints
-    ) -> Placed:
-        relations = landmarks([(anchors, pose)], self._settings.proposal)
-        return Placed(identifier, scan, pose, anchors, relations)
+    def _relate(self, known: Known) -> Landmarks:
+        return landmarks([(known.description.anchors, _placed(known)[1])], self._settings.proposal)
 
     def _all(self) -> Landmarks:
         if self._landmarks is None:
-            placed = sorted(self._placed.values(), key=lambda each: each.identifier)
+            known = [self._known[identifier] for identifier in self._identifiers.tolist()]
             self._landmarks = landmarks(
-                [(each.anchors, each.pose) for each in placed], self._settings.proposal
+                [(each.description.anchors, _placed(each)[1]) for each in known],
+                self._settings.proposal,
             )
         return self._landmarks
 
-    def _some(self, among: Sequence[int]) -> Landmarks:
-        return joined([self._placed[identifier].relations for identifier in among])
+    def _some(self, identifiers: NDArray[np.int64]) -> Landmarks:
+        return joined([self._relations[identifier] for identifier in identifiers.tolist()])
 
-    def _standing(self, among: Sequence[int] | None) -> Proposals:
+    def _standing(self) -> Proposals:
         """Return the poses of the references: a scan without anchors may stand at any."""
-        identifiers = self._placed if among is None else among
-        poses = np.array(
-            [
-                (pose.x, pose.y, pose.theta + turn)
-                for pose in (self._placed[identifier].pose for identifier in identifiers)
-                for turn in (0.0, math.pi)
-            ]
-        ).reshape(-1, 3)
+        poses = np.concatenate([self._poses, self._poses + np.array([0.0, 0.0, math.pi])])
         return Proposals(poses, np.zeros(len(poses)), len(poses))
 
 
+def _placed(known: Known) -> tuple[LaserScan, Pose2D]:
+    """Scan and pose of a reference that has one."""
+    if known.reference.pose is None:
+        raise ValueError(f"reference {known.reference.identifier} has no pose")
+    return known.reference.scan, known.reference.pose
+
+
 @kernel
-def _nearest(references, poses):  # type: ignore[no-untyped-def]
-    """Index of the reference pose nearest to each pose."""
+def _stand_for(references, poses):  # type: ignore[no-untyped-def]
+    """Index of the reference taken nearest to each pose, and ``T_reference_scan``.
+
+    A radian of turn counts as a metre.
+    """
     nearest = np.zeros(len(poses), np.int64)
+    relative = np.empty((len(poses), 3))
     for p in range(len(poses)):
         best = np.inf
         for r in range(len(references)):
-            distance = math.hypot(
-                references[r, 0] - poses[p, 0], references[r, 1] - poses[p, 1]
-            ) + abs(wrapped(references[r, 2] - poses[p, 2]))
+            dx, dy = poses[p, 0] - references[r, 0], poses[p, 1] - references[r, 1]
+            distance = math.hypot(dx, dy)
+            if distance >= best:
+                continue
+            distance += abs(wrapped(references[r, 2] - poses[p, 2]))
             if distance < best:
                 best = distance
                 nearest[p] = r
-    return nearest
+                c, s = math.cos(references[r, 2]), math.sin(references[r, 2])
+                relative[p, 0] = c * dx + s * dy
+                relative[p, 1] = c * dy - s * dx
+                relative[p, 2] = wrapped(poses[p, 2] - references[r, 2])
+    return nearest, relative
