@@ -187,6 +187,7 @@ def test_map_that_cannot_be_written_says_so(tmp_path: Path) -> None:
     [
         ({"image": None}, "has no image"),
         ({"image": 3}, "has no image"),
+        ({"image": "two\nlines"}, "names an image that cannot be one"),
         ({"resolution": None}, "the resolution is missing"),
         ({"resolution": 0}, "resolution must be positive"),
         ({"resolution": -0.05}, "resolution must be positive"),

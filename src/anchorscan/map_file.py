@@ -133,6 +133,8 @@ def _read_yaml(path: Path) -> _Keys:
     image = raw.get("image")
     if not isinstance(image, str) or not image.strip():
         raise LogError("has no image: it must name the file with the cells", path)
+    if not image.isprintable():
+        raise LogError(f"names an image that cannot be one: {image[:60]!r}", path)
     mode = raw.get("mode", "trinary")
     if mode not in _MODES:
         raise LogError(f"the mode must be one of {', '.join(_MODES)}, not {_shown(mode)}", path)
