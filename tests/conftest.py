@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import functools
 import os
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+
+from anchorscan import Record
 
 DATA = Path(
     os.environ.get(
@@ -26,3 +29,15 @@ def data_file() -> Callable[[str], Path]:
         return path
 
     return find
+
+
+@pytest.fixture(scope="session")
+def real_records(data_file: Callable[[str], Path]) -> Callable[[str], list[Record]]:
+    """Give the records of a log in the data folder, read once; or skip the test."""
+    from anchorscan import open_log
+
+    @functools.cache
+    def read(name: str) -> list[Record]:
+        return list(open_log(data_file(name)))
+
+    return read

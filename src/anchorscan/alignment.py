@@ -15,8 +15,9 @@ ways: a on v and b on w, or a on w and b on v.  Which of them are true is decide
 Several peaks of the histogram and of the matrix give several alignments.  All steps handle
 all candidate references in one call, over arrays laid one behind the other.
 
-The paper leaves the clustering open: here the hypothesis with the most others close to it is
-the centre, and everything close to their mean is the cluster.
+The paper leaves the clustering open.  Here the hypothesis around which the others lie most
+densely is the first centre; what is farther from it than three times the median distance of
+what is close is false; and the same once more around the mean.
 """
 
 from __future__ import annotations
@@ -197,6 +198,10 @@ def align(graph: AnchorGraph, references: GraphStack, settings: AlignmentSetting
         support[distinct],
         scatter[distinct],
     )
+
+
+# Squared distance, in units of the cluster's size, that is nothing but rounding.
+_ROUNDING = 1e-12
 
 
 @kernel
@@ -418,26 +423,52 @@ def _unify(poses, starts, distance, turn):  # type: ignore[no-untyped-def]
         mean = unified[g]
         mean[:] = group[_densest(group, distance, turn)]
         for _ in range(2):
-            for i in range(len(group)):
-                inside[i] = _close(group[i], mean, distance, turn)
+            _gather(group, mean, distance, turn, inside)
             support[g] = _centre(group, inside, mean)
         _spread(group, inside, mean, scatter[g])
     return unified, support, scatter, member
 
 
 @kernel
+def _apart(pose, other, distance, turn):  # type: ignore[no-untyped-def]
+    """Squared distance of two alignments; one is the border of what belongs together."""
+    dx, dy = (pose[0] - other[0]) / distance, (pose[1] - other[1]) / distance
+    dt = _turn(pose[2] - other[2]) / turn
+    return dx * dx + dy * dy + dt * dt
+
+
+@kernel
 def _densest(group, distance, turn):  # type: ignore[no-untyped-def]
-    """Index of the hypothesis that most others are close to."""
-    most = 0
+    """Index of the hypothesis around which the others lie most densely."""
+    highest = 0.0
     densest = 0
     for i in range(len(group)):
-        near = 0
+        density = 0.0
         for j in range(len(group)):
-            near += 1 if _close(group[j], group[i], distance, turn) else 0
-        if near > most:
-            most = near
+            density += max(0.0, 1.0 - _apart(group[j], group[i], distance, turn))
+        if density > highest:
+            highest = density
             densest = i
     return densest
+
+
+@kernel
+def _gather(group, mean, distance, turn, inside):  # type: ignore[no-untyped-def]
+    """Mark what belongs to a centre, less what is far off for how close most of it is."""
+    apart = np.empty(len(group))
+    near = 0
+    for i in range(len(group)):
+        off = _apart(group[i], mean, distance, turn)
+        inside[i] = off <= 1.0
+        if inside[i]:
+            apart[near] = off
+            near += 1
+    if near == 0:
+        return
+    # Three times the median distance; squared, with some slack for rounding.
+    limit = 9.0 * np.median(apart[:near]) + _ROUNDING
+    for i in range(len(group)):
+        inside[i] = _apart(group[i], mean, distance, turn) <= min(limit, 1.0)
 
 
 @kernel
@@ -472,13 +503,6 @@ def _spread(group, inside, mean, scatter):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _close(pose, other, distance, turn):  # type: ignore[no-untyped-def]
-    """Tell whether two alignments belong together."""
-    dx, dy = pose[0] - other[0], pose[1] - other[1]
-    return dx * dx + dy * dy <= distance * distance and abs(_turn(pose[2] - other[2])) <= turn
-
-
-@kernel
 def _distinct(poses, support, groups, distance, turn):  # type: ignore[no-untyped-def]
     """Alignments that differ, candidate after candidate, the best supported of equals."""
     chosen = np.empty(len(poses), np.int64)
@@ -490,7 +514,7 @@ def _distinct(poses, support, groups, distance, turn):  # type: ignore[no-untype
             g = c * groups + k
             new = support[g] > 0
             for other in chosen[begin:found]:
-                if _close(poses[g], poses[other], distance, turn):
+                if _apart(poses[g], poses[other], distance, turn) <= 1.0:
                     new = False
             if new:
                 chosen[found] = g

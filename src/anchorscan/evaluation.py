@@ -371,7 +371,8 @@ def _render(rows, pose, geometry, inverse):  # type: ignore[no-untyped-def]
                 _draw(k_before, span, over_before, over, step, period, inverse)
             else:
                 _draw(k, -span, over, over_before, step, period, inverse)
-        elif not joined:
+        if not (joined_before and joined):
+            # The margin of a surface reaches half a beam beyond its last reading.
             _draw(k - 0.5 + _SLACK, 1.0 - 3.0 * _SLACK, over, over, step, period, inverse)
 
 

@@ -1,0 +1,205 @@
+"""The relationship database against plain counting and a plain assignment."""
+
+from __future__ import annotations
+
+import threading
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
+
+from anchorscan import database
+from anchorscan.anchors import AnchorPoints
+from anchorscan.database import DatabaseSettings, RelationshipDatabase
+from anchorscan.graph import AnchorGraph, GraphSettings, anchor_graph
+
+TOLERANCE = 0.1
+
+
+def graph_of(lengths):
+    """Give a graph of which only the edge lengths matter."""
+    lengths = np.sort(np.asarray(lengths, dtype=np.float64))
+    count = len(lengths)
+    anchors = AnchorPoints(np.zeros((0, 2)), np.zeros(0, np.int64), np.zeros(0))
+    return AnchorGraph(anchors, np.zeros((count, 2), np.int32), lengths, np.zeros(count))
+
+
+def corresponds(a, b):
+    return abs(a - float(np.float32(b))) <= TOLERANCE
+
+
+def plain_pairs(query, reference):
+    return sum(corresponds(a, b) for a in query for b in reference)
+
+
+def plain_assignment(query, reference):
+    """Size of the largest one-to-one assignment, by augmenting paths."""
+    partner = {}
+
+    def assign(a, seen):
+        for k, b in enumerate(reference):
+            if k not in seen and corresponds(query[a], b):
+                seen.add(k)
+                if k not in partner or assign(partner[k], seen):
+                    partner[k] = a
+                    return True
+        return False
+
+    return sum(assign(a, set()) for a in range(len(query)))
+
+
+def plain_votes(query, references, count_once):
+    count = plain_assignment if count_once else plain_pairs
+    rows = []
+    for identifier, graph in references.items():
+        n = count(query.lengths, graph.lengths)
+        pairs = len(query) * len(graph)
+        rows.append((-(n * n / pairs if pairs else 0.0), identifier, n))
+    return [(identifier, n, -q) for q, identifier, n in sorted(rows)]
+
+
+def as_rows(votes):
+    return list(
+        zip(votes.references.tolist(), votes.counts.tolist(), votes.quality.tolist(), strict=True)
+    )
+
+
+lengths = st.lists(st.floats(0.0, 6.0).map(lambda v: round(v, 2)), max_size=12)
+
+
+@given(lengths, st.lists(lengths, max_size=6), st.booleans())
+def test_counts_and_quality_are_those_of_plain_counting(query, references, count_once):
+    graphs = {10 * k: graph_of(each) for k, each in enumerate(references)}
+    settings = DatabaseSettings(length_tolerance=TOLERANCE, count_once=count_once)
+    votes = RelationshipDatabase(settings, graphs.items()).votes(graph_of(query))
+
+    expected = plain_votes(graph_of(query), graphs, count_once)
+
+    assert [row[:2] for row in as_rows(votes)] == [row[:2] for row in expected]
+    assert votes.quality.tolist() == pytest.approx([row[2] for row in expected])
+
+
+@given(lengths, st.lists(lengths, max_size=8), st.integers(1, 9))
+def test_the_best_few_are_the_first_of_all(query, references, most):
+    settings = DatabaseSettings(length_tolerance=TOLERANCE)
+    graphs = [(k, graph_of(each)) for k, each in enumerate(references)]
+    searched = RelationshipDatabase(settings, graphs)
+
+    few = searched.votes(graph_of(query), most)
+
+    assert as_rows(few) == as_rows(searched.votes(graph_of(query)))[:most]
+
+
+@given(lengths.filter(bool))
+def test_counted_once_a_graph_corresponds_fully_to_itself(each):
+    settings = DatabaseSettings(length_tolerance=TOLERANCE, count_once=True)
+    votes = RelationshipDatabase(settings, [(3, graph_of(each))]).votes(graph_of(each))
+
+    assert votes.quality.tolist() == [1.0]
+
+
+@given(lengths, st.permutations(range(5)))
+def test_the_order_of_the_references_does_not_matter(query, order):
+    rng = np.random.default_rng(2)
+    graphs = [(k, graph_of(rng.uniform(0, 6, 5).round(1))) for k in range(5)]
+    settings = DatabaseSettings(length_tolerance=TOLERANCE)
+
+    straight = RelationshipDatabase(settings, graphs).votes(graph_of(query))
+    shuffled = RelationshipDatabase(settings, [graphs[k] for k in order]).votes(graph_of(query))
+
+    assert as_rows(straight) == as_rows(shuffled)
+
+
+class ChangingDatabase(RuleBasedStateMachine):
+    """Adding and removing in any order leaves what building at once would have made."""
+
+    def __init__(self):
+        super().__init__()
+        self.settings = DatabaseSettings(length_tolerance=TOLERANCE)
+        self.database = RelationshipDatabase(self.settings)
+        self.model = {}
+        self.query = graph_of([0.5, 1.0, 1.02, 2.5, 4.0])
+        self.next = 0
+        self.before = database._SMALLEST_RECENT
+        database._SMALLEST_RECENT = 12  # so that merges happen
+
+    def teardown(self):
+        database._SMALLEST_RECENT = self.before
+
+    @rule(each=lengths)
+    def add(self, each):
+        self.model[self.next] = graph_of(each)
+        self.database.add(self.next, self.model[self.next])
+        self.next += 1
+
+    @precondition(lambda self: self.model)
+    @rule(data=st.data())
+    def remove(self, data):
+        identifier = data.draw(st.sampled_from(sorted(self.model)))
+        del self.model[identifier]
+        self.database.remove(identifier)
+
+    @invariant()
+    def votes_as_built_at_once(self):
+        at_once = RelationshipDatabase(self.settings, self.model.items())
+        assert as_rows(self.database.votes(self.query)) == as_rows(at_once.votes(self.query))
+        assert as_rows(self.database.votes(self.query, 3)) == as_rows(at_once.votes(self.query, 3))
+        assert len(self.database) == len(self.model)
+
+
+TestChangingDatabase = ChangingDatabase.TestCase
+
+
+def test_an_identifier_is_taken_once():
+    searched = RelationshipDatabase(DatabaseSettings(), [(4, graph_of([1.0]))])
+    with pytest.raises(ValueError, match="4"):
+        searched.add(4, graph_of([2.0]))
+    with pytest.raises(ValueError, match="identifier"):
+        RelationshipDatabase(DatabaseSettings(), [(1, graph_of([])), (1, graph_of([]))])
+    with pytest.raises(KeyError):
+        searched.remove(5)
+    assert 4 in searched
+    assert 5 not in searched
+
+
+def test_real_graphs_are_counted_as_plain_counting_does(real_records):
+    from anchorscan.anchors import AnchorSettings, anchor_points
+
+    records = real_records("freiburg-101.log.gz")[::15]
+    graphs = {
+        record.index: anchor_graph(anchor_points(record.scan, AnchorSettings()), GraphSettings())
+        for record in records
+    }
+    query = graphs.pop(records[7].index)
+    for count_once in (False, True):
+        settings = DatabaseSettings(length_tolerance=TOLERANCE, count_once=count_once)
+        votes = RelationshipDatabase(settings, graphs.items()).votes(query)
+        expected = plain_votes(query, graphs, count_once)
+        assert [row[:2] for row in as_rows(votes)] == [row[:2] for row in expected]
+
+
+def test_searching_goes_on_while_references_come_and_go():
+    rng = np.random.default_rng(1)
+    fixed = [(k, graph_of(rng.uniform(0, 20, 30))) for k in range(40)]
+    searched = RelationshipDatabase(DatabaseSettings(length_tolerance=TOLERANCE), fixed)
+    query = graph_of(rng.uniform(0, 20, 30))
+    expected = {row[0]: row[1] for row in as_rows(searched.votes(query))}
+    stop = threading.Event()
+    wrong = []
+
+    def search():
+        while not stop.is_set():
+            got = {row[0]: row[1] for row in as_rows(searched.votes(query))}
+            wrong.extend(k for k in expected if got.get(k) != expected[k])
+
+    searcher = threading.Thread(target=search)
+    searcher.start()
+    for k in range(1000, 1600):
+        searched.add(k, graph_of(rng.uniform(0, 20, 30)))
+        if k % 3:
+            searched.remove(k)
+    stop.set()
+    searcher.join()
+    assert not wrong
