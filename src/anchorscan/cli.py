@@ -17,6 +17,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from enum import Enum
 from functools import wraps
 from itertools import islice
 from pathlib import Path
@@ -47,6 +48,14 @@ _DECIMALS = 6
 # Scans that a worker process takes at once, and how many such lots may wait for it.
 _CHUNK = 16
 _CHUNKS_AHEAD = 4
+
+
+class Body(str, Enum):
+    """Whose poses a recording or a file of poses holds."""
+
+    base = "base"
+    laser = "laser"
+
 
 app = typer.Typer(
     name="anchorscan",
@@ -122,6 +131,19 @@ def _parse_candidates(text: str) -> int | str:
     raise typer.BadParameter(f"{text!r} is neither a positive number nor 'all'")
 
 
+def _parse_laser(text: str) -> Pose2D:
+    from .pose import Pose2D
+
+    try:
+        x, y, degrees = (float(part) for part in text.split(","))
+        T_base_laser = Pose2D(x, y, math.radians(degrees))
+    except ValueError:
+        raise typer.BadParameter(f"{text!r} is not X,Y,DEG") from None
+    if not T_base_laser.is_finite():
+        raise typer.BadParameter(f"{text!r} is nowhere")
+    return T_base_laser
+
+
 def _parse_preset(text: str) -> str:
     if text not in ("default", "paper", "thorough"):
         raise typer.BadParameter(f"{text!r} is none of default, paper, thorough")
@@ -137,6 +159,13 @@ FieldOfViewOption = Annotated[
 RangeMaxOption = Annotated[
     float | None,
     typer.Option(metavar="M", help="From this range on a reading means 'no return'."),
+]
+TopicOption = Annotated[
+    str | None, typer.Option(metavar="TOPIC", help="Scans of a ROS recording that has several.")
+]
+UpsideDownOption = Annotated[
+    bool,
+    typer.Option("--upside-down", help="The laser of a ROS recording hangs with its z axis down."),
 ]
 PresetOption = Annotated[
     str | None,
@@ -166,14 +195,23 @@ def build(
         float, typer.Option(min=0.0, max=180.0, metavar="DEG", help="... or degrees.")
     ] = 45.0,
     keep_all: Annotated[bool, typer.Option("--all", help="Keep every scan with a pose.")] = False,
-    odometry_poses: Annotated[
-        bool,
-        typer.Option(
-            "--odometry-poses", help="The log is raw: its x y theta columns are odometry."
-        ),
-    ] = False,
     field_of_view: FieldOfViewOption = None,
     range_max: RangeMaxOption = None,
+    topic: TopicOption = None,
+    poses: Annotated[
+        str | None,
+        typer.Option(metavar="FILE|TOPIC", help="Poses from a TUM file, a topic, or /tf."),
+    ] = None,
+    poses_of: Annotated[
+        Body, typer.Option(help="Whose poses those are, if a topic does not say.")
+    ] = Body.base,
+    laser: Annotated[
+        Any,
+        typer.Option(
+            parser=_parse_laser, metavar="X,Y,DEG", help="Where the laser sits on the robot."
+        ),
+    ] = None,
+    upside_down: UpsideDownOption = False,
     preset: PresetOption = None,
     settings_file: SettingsOption = None,
 ) -> None:
@@ -184,11 +222,12 @@ def build(
     from .reference_set import ReferenceSet
 
     settings = _read_settings(preset, settings_file)
-    opened = [
-        _open_log(log, field_of_view, range_max, "odometry" if odometry_poses else "corrected")
-        for log in logs
-    ]
-    records = _progress(_all_records(opened), "reading", _total(opened))
+    options = {
+        **_reading(field_of_view, range_max, topic, upside_down),
+        **{"poses": poses, "poses_of": poses_of.value, "T_base_laser": laser},
+    }
+    opened = [_open_log(log, options) for log in logs]
+    records = _progress(_records(*opened), "reading", _total(*opened))
     with ReferenceSet.build(
         records,
         spacing=spacing,
@@ -223,6 +262,8 @@ def locate(
     ] = 1,
     field_of_view: FieldOfViewOption = None,
     range_max: RangeMaxOption = None,
+    topic: TopicOption = None,
+    upside_down: UpsideDownOption = False,
     preset: PresetOption = None,
     settings_file: SettingsOption = None,
 ) -> None:
@@ -231,9 +272,9 @@ def locate(
     One JSON object a scan, in the order of the log, hypotheses best first; the poses are those
     of the laser in the frame of the set, in metres and radians.
     """
-    opened = _open_log(log, field_of_view, range_max)
+    opened = _open_log(log, _reading(field_of_view, range_max, topic, upside_down))
     settings = _read_settings(preset, settings_file)
-    records = _progress(opened, "locating", opened.count)
+    records = _progress(_records(opened), "locating", opened.count)
     accepted = unusable = count = 0
     with _writing(output) as stream:
         for line in _located(records, set_file, settings, candidates, processes):
@@ -242,7 +283,6 @@ def locate(
             count += 1
             accepted += line["accepted"]
             unusable += "reason" in line
-    _report_problems(opened)
     _say(
         f"{log}: {count} scans: {accepted} located, {count - accepted - unusable} not known, "
         f"{unusable} unusable"
@@ -285,26 +325,34 @@ def demo(
 # Reading
 
 
-def _open_log(
-    path: Path, field_of_view: float | None, range_max: float | None, pose_columns: Any = None
-) -> Log:
+def _reading(
+    field_of_view: float | None, range_max: float | None, topic: str | None, upside_down: bool
+) -> dict[str, Any]:
+    """Return what every command may say about a log, as ``open_log`` wants it."""
+    return {
+        "field_of_view": None if field_of_view is None else math.radians(field_of_view),
+        "range_max": range_max,
+        "topic": topic,
+        "is_upside_down": upside_down or None,
+    }
+
+
+def _open_log(path: Path, options: dict[str, Any]) -> Log:
     from .io import open_log
 
-    return open_log(
-        path,
-        field_of_view=None if field_of_view is None else math.radians(field_of_view),
-        range_max=range_max,
-        **({} if pose_columns is None else {"pose_columns": pose_columns}),
-    )
+    return open_log(path, **options)
 
 
-def _all_records(logs: list[Log]) -> Iterator[Record]:
+def _records(*logs: Log) -> Iterator[Record]:
+    """Read logs one after the other, and say what was guessed and what was malformed."""
     for log in logs:
+        for note in log.notes:
+            _say(f"note: {log.path}: {note}")
         yield from log
         _report_problems(log)
 
 
-def _total(logs: list[Log]) -> int | None:
+def _total(*logs: Log) -> int | None:
     total = 0
     for log in logs:
         if log.count is None:
