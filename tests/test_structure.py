@@ -24,7 +24,7 @@ ORDER = (
     *("field", "proposal", "verification", "evaluation", "hypothesis", "decision", "settings"),
     *("description", "pairwise", "stitched_map", "matcher"),
     *("set_file", "set_directory", "reference_set", "localizer"),
-    *("sensor", "occupancy", "map_file", "simulator", "exhaustive_search"),
+    *("sensor", "occupancy", "map_file", "world", "building", "simulator", "exhaustive_search"),
 )
 VALUES = {"errors", "pose", "scan", "record", "reference"}
 # Imported by nobody, but for the command line, which loads them inside its commands.

@@ -9,6 +9,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:  # what type checkers and editors see; a test holds it equal to _HOMES
+    from .building import random_building as random_building
     from .errors import AnchorscanError as AnchorscanError
     from .errors import LogError as LogError
     from .errors import MissingExtraError as MissingExtraError
@@ -35,10 +36,9 @@ if TYPE_CHECKING:  # what type checkers and editors see; a test holds it equal t
     from .scan import LaserScan as LaserScan
     from .sensor import SensorModel as SensorModel
     from .settings import Settings as Settings
-    from .simulator import World as World
     from .simulator import drive as drive
-    from .simulator import random_building as random_building
     from .simulator import simulate as simulate
+    from .world import World as World
 
 __version__ = "0.1.0"
 
@@ -63,12 +63,12 @@ _HOMES = {
     "Settings": "settings",
     "SettingsError": "errors",
     "Trace": "matcher",
-    "World": "simulator",
+    "World": "world",
     "drive": "simulator",
     "load_map": "map_file",
     "match": "matcher",
     "open_log": "io",
-    "random_building": "simulator",
+    "random_building": "building",
     "reference_scans": "occupancy",
     "simulate": "simulator",
     "stitch": "occupancy",
