@@ -67,7 +67,13 @@ class EvaluationSettings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    tolerance: float = Field(0.2, gt=0.0, description="readings that differ no more agree, metres")
+    tolerance: float = Field(0.05, gt=0.0, description="readings that differ no more agree, metres")
+    relative_tolerance: float = Field(
+        0.05, ge=0.0, description="what is added to that for every metre of range"
+    )
+    largest_tolerance: float = Field(
+        0.2, gt=0.0, description="readings that differ more never agree, metres"
+    )
 
 
 class AcceptanceSettings(BaseModel):
@@ -198,7 +204,7 @@ def evaluate_all(
         references.geometries,
         candidates,
         poses,
-        settings.tolerance,
+        (settings.tolerance, settings.relative_tolerance, settings.largest_tolerance),
     )
     return e_m
 
@@ -402,20 +408,22 @@ def _draw(k, span, over, over_end, step, period, inverse):  # type: ignore[no-un
 
 
 @kernel
-def _agreement(rows, geometry, inverse, tolerance):  # type: ignore[no-untyped-def]
+def _agreement(rows, geometry, inverse, tolerances):  # type: ignore[no-untyped-def]
     """Share of the front scan's returns that agree with the synthetic scan."""
+    least, relative, largest = tolerances
     agree = 0
     for i in range(len(rows)):
         beam = int(_positive(rows[i, _BEAM] - geometry[0] + _SLACK) / geometry[1] + 0.5)
         if beam >= len(inverse) or inverse[beam] <= 0.0:
             continue
+        tolerance = min(least + relative * rows[i, _RANGE], largest)
         if abs(1.0 / inverse[beam] - rows[i, _RANGE]) <= tolerance:
             agree += 1
     return agree / len(rows) if len(rows) > 0 else 0.0
 
 
 @kernel
-def _evaluations(rows, geometry, all_rows, starts, geometries, candidates, poses, tolerance):  # type: ignore[no-untyped-def]
+def _evaluations(rows, geometry, all_rows, starts, geometries, candidates, poses, tolerances):  # type: ignore[no-untyped-def]
     """(N,) e_m of all alignments."""
     e_m = np.empty(len(poses))
     most = geometry[2]
@@ -432,10 +440,10 @@ def _evaluations(rows, geometry, all_rows, starts, geometries, candidates, poses
             co, si = math.cos(pose[2]), math.sin(pose[2])
             back = np.array((-co * pose[0] - si * pose[1], si * pose[0] - co * pose[1], -pose[2]))
             _render(reference_rows, back, geometry, inverse)
-            e_m[n] = _agreement(rows, geometry, inverse, tolerance)
+            e_m[n] = _agreement(rows, geometry, inverse, tolerances)
         else:
             inverse = scratch[: int(geometries[c, 2])]
             inverse[:] = 0.0
             _render(rows, pose, geometries[c], inverse)
-            e_m[n] = _agreement(reference_rows, geometries[c], inverse, tolerance)
+            e_m[n] = _agreement(reference_rows, geometries[c], inverse, tolerances)
     return e_m
