@@ -40,7 +40,6 @@ from .angle_function import (
     AngleFunctionSettings,
     angle_function,
     line_through,
-    walked,
     wrapped,
 )
 from .scan import LaserScan
@@ -256,38 +255,26 @@ def _jump_edges(points, gaps, way, moments, first, last, limits):  # type: ignor
             if abs(way[other] - way[at]) < shortest:
                 continue
             begin, end = min(at, other), max(at, other)
-            _, _, direction, error = line_through(moments, begin, end)
+            dx, dy = points[end, 0] - points[begin, 0], points[end, 1] - points[begin, 1]
+            _, _, ux, uy, error = line_through(moments, begin, end, dx, dy)
             if error > flatness:
                 continue
-            direction = walked(
-                direction, points[end, 0] - points[begin, 0], points[end, 1] - points[begin, 1]
-            )
-            ray = math.atan2(points[at, 1], points[at, 0])
-            if abs(math.sin(direction - ray)) < math.sin(rim):
+            across = abs(ux * points[at, 1] - uy * points[at, 0])
+            if across < math.sin(rim) * math.hypot(points[at, 0], points[at, 1]):
                 continue
             rows[found, 0] = points[at, 0]
             rows[found, 1] = points[at, 1]
-            rows[found, 2] = wrapped(direction + 0.5 * math.pi)
+            rows[found, 2] = math.atan2(ux, -uy)
             rows[found, 3] = side
             found += 1
     return rows[:found]
 
 
 @kernel
-def _turn(points, moments, first, here, last, flatness):  # type: ignore[no-untyped-def]
-    """Lines of both arms at a return: turn between them, or 0 where either is not straight."""
-    ax, ay, a, error = line_through(moments, first, here)
-    bx, by, b, error_b = line_through(moments, here, last)
-    a = walked(a, points[here, 0] - points[first, 0], points[here, 1] - points[first, 1])
-    b = walked(b, points[last, 0] - points[here, 0], points[last, 1] - points[here, 1])
-    turn = wrapped(b - a)
-    return ax, ay, a, bx, by, b, turn, max(error, error_b) <= flatness
-
-
-@kernel
 def _angle_anchors(points, way, moments, first, last, limits):  # type: ignore[no-untyped-def]
     """Places within large surfaces where the surface angle changes."""
     arm, shortest, flatness, smallest_turn, farthest = limits
+    straightest, sharpest = math.cos(smallest_turn), math.cos(0.95 * math.pi)
     rows = np.empty((len(points), 4))
     strength = np.empty(len(points))
     found = 0
@@ -305,16 +292,25 @@ def _angle_anchors(points, way, moments, first, last, limits):  # type: ignore[n
                 continue
             if end - i < 2 or i - begin < 2:
                 continue
-            ax, ay, a, bx, by, b, turn, flat = _turn(points, moments, begin, i, end, flatness)
-            size = abs(turn)
-            if not flat or size < smallest_turn or size > 0.95 * math.pi:
+            ax, ay, au, av, error = line_through(
+                moments, begin, i, points[i, 0] - points[begin, 0], points[i, 1] - points[begin, 1]
+            )
+            if error > flatness:
                 continue
-            along = ((bx - ax) * math.sin(b) - (by - ay) * math.cos(b)) / math.sin(b - a)
-            x, y = ax + along * math.cos(a), ay + along * math.sin(a)
+            bx, by, bu, bv, error = line_through(
+                moments, i, end, points[end, 0] - points[i, 0], points[end, 1] - points[i, 1]
+            )
+            dot = au * bu + av * bv
+            if error > flatness or dot > straightest or dot < sharpest:
+                continue
+            cross = au * bv - av * bu
+            along = ((bx - ax) * bv - (by - ay) * bu) / cross
+            x, y = ax + along * au, ay + along * av
             off = math.hypot(x - points[i, 0], y - points[i, 1])
             if off > farthest:
                 continue
-            quality = size / smallest_turn - off / farthest
+            turn = math.atan2(cross, dot)
+            quality = abs(turn) / smallest_turn - off / farthest
             if (
                 found > previous
                 and math.hypot(rows[found - 1, 0] - x, rows[found - 1, 1] - y) < arm
@@ -324,7 +320,7 @@ def _angle_anchors(points, way, moments, first, last, limits):  # type: ignore[n
                 found -= 1
             rows[found, 0] = x
             rows[found, 1] = y
-            rows[found, 2] = wrapped(a + 0.5 * turn + 0.5 * math.pi)
+            rows[found, 2] = wrapped(math.atan2(av, au) + 0.5 * (turn + math.pi))
             rows[found, 3] = 3.0 if turn > 0.0 else 2.0
             strength[found] = quality
             found += 1

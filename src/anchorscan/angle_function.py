@@ -176,12 +176,15 @@ def _free_before(ranges, range_max, increment, count):  # type: ignore[no-untype
 
 
 @kernel
-def _gap(near, far, angle, limits):  # type: ignore[no-untyped-def]
-    """Tell whether two returns, ``angle`` apart, may lie on one surface."""
-    grazing, noise, largest, _ = limits
-    apart = math.sqrt(near * near + far * far - 2.0 * near * far * math.cos(angle))
-    reach = near * math.sin(angle) / math.sin(grazing - angle) if angle < grazing else largest
-    return apart > min(reach + noise, max(largest, 2.0 * noise))
+def _gap(near, far, cosine, spread, limits):  # type: ignore[no-untyped-def]
+    """Tell whether two returns on neighbouring rays may lie on one surface.
+
+    ``cosine`` is of the angle between the rays; ``spread`` is how far apart, per metre of
+    range, they may be on a surface seen under the flattest incidence.
+    """
+    apart = near * near + far * far - 2.0 * near * far * cosine
+    reach = min(near * spread + limits[1], max(limits[2], 2.0 * limits[1]))
+    return apart <= reach * reach
 
 
 @kernel
@@ -190,6 +193,12 @@ def _gaps(points, ranges, beams, indices, free, turn, step, limits):  # type: ig
     count = len(ranges)
     gaps = np.full(count, UNKNOWN, np.int64)
     most_missing = 3
+    cosine = np.empty(most_missing + 2)
+    spread = np.empty(most_missing + 2)
+    for k in range(most_missing + 2):
+        cosine[k] = math.cos(k * step)
+        flattest = limits[0] - k * step
+        spread[k] = math.sin(k * step) / math.sin(flattest) if flattest > 0.0 else np.inf
     for i in range(count):
         j = i + 1
         if j == count:
@@ -209,7 +218,7 @@ def _gaps(points, ranges, beams, indices, free, turn, step, limits):  # type: ig
             continue
         near = min(ranges[i], ranges[j])
         far = max(ranges[i], ranges[j])
-        if not _gap(near, far, between * step, limits):
+        if _gap(near, far, cosine[between], spread[between], limits):
             gaps[i] = CONNECTED
         elif far - near >= limits[3]:
             gaps[i] = TO_FAR if ranges[j] > ranges[i] else TO_NEAR
@@ -272,10 +281,16 @@ def _runs(points, gaps):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def line_through(moments, first, last):  # type: ignore[no-untyped-def]
-    """Total least squares line of returns ``first`` to ``last``: centre, direction, rms error.
+def wrapped(angle):  # type: ignore[no-untyped-def]
+    """Wrap an angle into [-pi, pi)."""
+    return angle - 2.0 * math.pi * math.floor((angle + math.pi) / (2.0 * math.pi))
 
-    The direction is modulo 180 degrees; the caller chooses its sense.
+
+@kernel
+def line_through(moments, first, last, dx, dy):  # type: ignore[no-untyped-def]
+    """Total least squares line of returns ``first`` to ``last``, in the sense of (dx, dy).
+
+    Returns its centre, its unit vector and its rms error.
     """
     n = last - first + 1.0
     cx = (moments[last + 1, 0] - moments[first, 0]) / n
@@ -283,23 +298,16 @@ def line_through(moments, first, last):  # type: ignore[no-untyped-def]
     xx = (moments[last + 1, 2] - moments[first, 2]) / n - cx * cx
     xy = (moments[last + 1, 3] - moments[first, 3]) / n - cx * cy
     yy = (moments[last + 1, 4] - moments[first, 4]) / n - cy * cy
-    direction = 0.5 * math.atan2(2.0 * xy, xx - yy)
     spread = math.sqrt((xx - yy) * (xx - yy) + 4.0 * xy * xy)
-    return cx, cy, direction, math.sqrt(max(0.5 * (xx + yy - spread), 0.0))
-
-
-@kernel
-def wrapped(angle):  # type: ignore[no-untyped-def]
-    """Wrap an angle into [-pi, pi)."""
-    return angle - 2.0 * math.pi * math.floor((angle + math.pi) / (2.0 * math.pi))
-
-
-@kernel
-def walked(direction, dx, dy):  # type: ignore[no-untyped-def]
-    """Give a line's direction the sense of the way (dx, dy) along it."""
-    if math.cos(direction) * dx + math.sin(direction) * dy < 0.0:
-        direction += math.pi
-    return wrapped(direction)
+    error = math.sqrt(max(0.5 * (xx + yy - spread), 0.0))
+    # The longer of the two forms of the eigenvector, which does not cancel.
+    ux, uy = (xx - yy + spread, 2.0 * xy) if xx >= yy else (2.0 * xy, yy - xx + spread)
+    length = math.sqrt(ux * ux + uy * uy)
+    if length <= 0.0:
+        return cx, cy, 1.0, 0.0, error
+    if ux * dx + uy * dy < 0.0:
+        length = -length
+    return cx, cy, ux / length, uy / length, error
 
 
 @kernel
@@ -325,10 +333,8 @@ def _surface(points, runs, way, moments, baseline, fitted):  # type: ignore[no-u
         if dx * dx + dy * dy < 0.0625 * baseline * baseline:
             continue
         if fitted and last - begin >= 2:
-            direction = line_through(moments, begin, last)[2]
-            surface[i] = walked(direction, dx, dy)
-        else:
-            surface[i] = math.atan2(dy, dx)
+            _, _, dx, dy, _ = line_through(moments, begin, last, dx, dy)
+        surface[i] = math.atan2(dy, dx)
     return surface
 
 

@@ -25,6 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
+from ._jit import kernel
 from .verification import FEATURES, Fits
 
 __all__ = ["Decision", "DecisionSettings", "covariance", "decide", "evidence"]
@@ -91,10 +92,33 @@ def covariance(fits: Fits, settings: DecisionSettings) -> NDArray[np.float64]:
     The inverse of the Hessian of the refinement, scaled by the residuals that were observed:
     wide along a plain corridor, where no reading holds the pose.
     """
-    variance = np.maximum(fits.residuals, settings.range_deviation**2) * settings.readings_alike
-    information = fits.hessians / variance[:, np.newaxis, np.newaxis]
-    floor = np.eye(3) / settings.widest_deviation**2
-    return np.asarray(np.linalg.inv(information + floor))
+    covariances: NDArray[np.float64] = _covariances(
+        fits.hessians,
+        fits.residuals,
+        settings.range_deviation**2,
+        settings.readings_alike,
+        1.0 / settings.widest_deviation**2,
+    )
+    return covariances
+
+
+@kernel
+def _covariances(hessians, residuals, least, alike, floor):  # type: ignore[no-untyped-def]
+    """Inverse of each scaled Hessian plus a floor, symmetric by construction."""
+    out = np.empty(hessians.shape)
+    for k in range(len(hessians)):
+        h = hessians[k] / (max(residuals[k], least) * alike)
+        a, b, c = h[0, 0] + floor, h[0, 1], h[0, 2]
+        d, e, f = h[1, 1] + floor, h[1, 2], h[2, 2] + floor
+        p, q, r = d * f - e * e, c * e - b * f, b * e - c * d
+        s, t, u = a * f - c * c, b * c - a * e, a * d - b * b
+        determinant = a * p + b * q + c * r
+        out[k, 0, 0], out[k, 1, 1], out[k, 2, 2] = p, s, u
+        out[k, 0, 1] = out[k, 1, 0] = q
+        out[k, 0, 2] = out[k, 2, 0] = r
+        out[k, 1, 2] = out[k, 2, 1] = t
+        out[k] /= determinant
+    return out
 
 
 def decide(fits: Fits, settings: DecisionSettings) -> Decision:
@@ -109,8 +133,10 @@ def decide(fits: Fits, settings: DecisionSettings) -> Decision:
         settings.through,
     )
     best = 1.0 / (1.0 + math.exp(-float(np.dot(evidence(fits), weights))))
-    rivals = np.exp(
-        settings.rivalry * (np.append(fits.features[1:, _SCORE], settings.elsewhere) - 1.0)
-    )
-    rest = (1.0 - best) * rivals / rivals.sum()
-    return Decision(np.append(best, rest[:-1]), float(rest[-1]), best >= settings.threshold)
+    rivals = [
+        math.exp(settings.rivalry * (score - 1.0))
+        for score in (*fits.features[1:, _SCORE].tolist(), settings.elsewhere)
+    ]
+    share = (1.0 - best) / sum(rivals)
+    probabilities = np.array([best, *(share * rival for rival in rivals[:-1])])
+    return Decision(probabilities, share * rivals[-1], best >= settings.threshold)

@@ -45,8 +45,7 @@ _HEADINGS = 256
 _TRIGONOMETRY = 1 << 12
 _ANGLES = (np.arange(_TRIGONOMETRY) + 0.5) * (2.0 * math.pi / _TRIGONOMETRY)
 _COSINE, _SINE = np.cos(_ANGLES), np.sin(_ANGLES)
-# Memory of proposals already made: a table of cells, and the size of a cell.
-_SLOTS = 1 << 15
+# A proposal in the same cell of position as one before it is the same.
 _CELL = 0.12
 _MOST = 1 << 16
 
@@ -58,9 +57,9 @@ class ProposalSettings(BaseModel):
 
     shortest_edge: float = Field(0.5, ge=0.0, description="relations that are used, metres")
     longest_edge: float = Field(15.0, gt=0.0, description="relations that are used, metres")
-    length_tolerance: float = Field(0.15, gt=0.0, description="corresponding lengths, metres")
+    length_tolerance: float = Field(0.1, gt=0.0, description="corresponding lengths, metres")
     direction_tolerance: float = Field(
-        math.radians(35.0), gt=0.0, description="direction at an anchor to its edge, radians"
+        math.radians(25.0), gt=0.0, description="direction at an anchor to its edge, radians"
     )
     heading_tolerance: float = Field(
         math.radians(10.0), gt=0.0, description="edge to main angles, radians"
@@ -70,7 +69,7 @@ class ProposalSettings(BaseModel):
     )
     enough: int = Field(300, ge=0, description="with so many from edges no lone anchors")
     readings: int = Field(12, ge=4, description="readings of the first check")
-    most: int = Field(400, ge=1, description="proposals that pass the first check")
+    most: int = Field(250, ge=1, description="proposals that pass the first check")
     landmark_cell: float = Field(0.2, gt=0.0, description="anchors merged within, metres")
     landmark_turn: float = Field(math.radians(30.0), gt=0.0, description="and within, radians")
 
@@ -323,14 +322,13 @@ def _is_new(seen, x, y, heading):  # type: ignore[no-untyped-def]
     cx = np.uint64(np.int64(math.floor(x / _CELL)) + (1 << 24))
     cy = np.uint64(np.int64(math.floor(y / _CELL)) + (1 << 24))
     key = (cx << np.uint64(34)) ^ (cy << np.uint64(8)) ^ np.uint64(heading)
-    slot = (key * np.uint64(0x9E3779B97F4A7C15)) >> np.uint64(49)
-    for _ in range(8):
+    last = np.uint64(len(seen) - 1)
+    slot = ((key * np.uint64(0x9E3779B97F4A7C15)) >> np.uint64(40)) & last
+    while seen[slot] != 0:
         if seen[slot] == key:
             return False
-        if seen[slot] == 0:
-            seen[slot] = key
-            return True
-        slot = (slot + np.uint64(1)) & np.uint64(_SLOTS - 1)
+        slot = (slot + np.uint64(1)) & last
+    seen[slot] = key
     return True
 
 
@@ -454,7 +452,10 @@ def _propose(query, chosen, known, tiles, limits):  # type: ignore[no-untyped-de
     if found < limits[6]:
         found = _lone_proposals(query, known, limits, out, found)
     table = _rotated(chosen, tiles)
-    seen = np.zeros(_SLOTS, np.uint64)
+    slots = 64
+    while slots < 2 * found:
+        slots *= 2
+    seen = np.zeros(slots, np.uint64)
     scores = np.empty(found, np.int32)
     kept = 0
     for k in range(found):

@@ -34,11 +34,11 @@ class VerificationSettings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    second_readings: int = Field(48, ge=4, description="readings of the second check")
-    third_readings: int = Field(120, ge=4, description="readings of the third check")
-    third_poses: int = Field(80, ge=1, description="poses that reach the third check")
-    fits: int = Field(10, ge=1, description="distinct poses that are refined")
-    fit_readings: int = Field(120, ge=4, description="readings of the refinement")
+    second_readings: int = Field(32, ge=4, description="readings of the second check")
+    third_readings: int = Field(80, ge=4, description="readings of the third check")
+    third_poses: int = Field(50, ge=1, description="poses that reach the third check")
+    fits: int = Field(8, ge=1, description="distinct poses that are refined")
+    fit_readings: int = Field(72, ge=4, description="readings of the refinement")
     iterations: int = Field(8, ge=0, description="steps of the refinement")
     distinct_distance: float = Field(0.4, gt=0.0, description="poses nearer are one, metres")
     distinct_turn: float = Field(
@@ -48,8 +48,11 @@ class VerificationSettings(BaseModel):
     place_turn: float = Field(
         math.radians(20.0), gt=0.0, description="fits turned less are one place, radians"
     )
-    last_readings: int = Field(180, ge=4, description="readings of the last numbers")
-    rays: int = Field(90, ge=4, description="rays followed through the map")
+    last_readings: int = Field(120, ge=4, description="readings of the last numbers")
+    followed: int = Field(
+        2, ge=1, description="best fits whose rays are followed; the others' share is NaN"
+    )
+    rays: int = Field(45, ge=4, description="rays followed through the map")
     through_margin: float = Field(0.3, gt=0.0, description="end of a ray that may touch, metres")
 
 
@@ -100,10 +103,10 @@ def verify(
     )
     chosen = _sieve(poses, points, tiles, weights, sieves)
     steps = (settings.fit_readings, settings.iterations)
-    last = (settings.last_readings, settings.rays, settings.through_margin)
-    fits = _fit(chosen, points, tiles, weights, steps, last)
-    places = _distinct(fits[0], settings.place_distance, settings.place_turn, settings.fits)
-    return Fits(*(values[places] for values in fits))
+    places = (settings.place_distance, settings.place_turn)
+    rays = (settings.rays, settings.through_margin, settings.followed)
+    steps = (settings.fit_readings, settings.iterations, settings.last_readings)
+    return Fits(*_fit(chosen, points, tiles, weights, steps, places, rays))
 
 
 @kernel
@@ -139,14 +142,18 @@ def _distinct(poses, distance, turn, most):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _features(pose, points, tiles, weights, rays, margin):  # type: ignore[no-untyped-def]
-    """The numbers of ``FEATURES`` for one pose."""
-    numbers = np.zeros(7)
-    c, s = math.cos(pose[2]), math.sin(pose[2])
+def _features(pose, points, tiles, weights, numbers):  # type: ignore[no-untyped-def]
+    """The numbers of ``FEATURES`` for one pose, but for the rays."""
+    numbers[:] = 0.0
+    c, s = math.cos(pose[2]) / tiles.resolution, math.sin(pose[2]) / tiles.resolution
+    x = pose[0] / tiles.resolution - tiles.column
+    y = pose[1] / tiles.resolution - tiles.row
     for i in range(len(points)):
-        gx = (pose[0] + c * points[i, 0] - s * points[i, 1]) / tiles.resolution - tiles.column
-        gy = (pose[1] + s * points[i, 0] + c * points[i, 1]) / tiles.resolution - tiles.row
-        code = cell_code(tiles, int(gx), int(gy))
+        code = cell_code(
+            tiles,
+            int(x + c * points[i, 0] - s * points[i, 1]),
+            int(y + s * points[i, 0] + c * points[i, 1]),
+        )
         distance = (code & 63) * tiles.reach / 63.0
         free = (code & 64) > 0
         numbers[0] += weights[code]
@@ -157,26 +164,31 @@ def _features(pose, points, tiles, weights, rays, margin):  # type: ignore[no-un
         elif distance > 0.2 and free:
             numbers[6] += 1
     numbers /= max(len(points), 1)
-    numbers[5] = passed_through(pose, spread(points, rays), tiles, margin)
-    return numbers
 
 
 @kernel
-def _fit(poses, points, tiles, weights, steps, last):  # type: ignore[no-untyped-def]
-    """Refine every pose and take its numbers, best score first."""
+def _fit(poses, points, tiles, weights, steps, places, rays):  # type: ignore[no-untyped-def]
+    """Refine every pose and take the numbers of each place, best score first."""
     count = len(poses)
     moved = np.empty((count, 3))
     features = np.empty((count, 7))
-    hessians = np.empty((count, 3, 3))
-    residuals = np.empty(count)
     few = spread(points, steps[0])
-    many = spread(points, last[0])
+    many = spread(points, steps[2])
     for k in range(count):
         moved[k] = refined(poses[k], few, tiles, steps[1])
         moved[k, 2] = wrapped(moved[k, 2])
-        features[k] = _features(moved[k], many, tiles, weights, last[1], last[2])
+        _features(moved[k], many, tiles, weights, features[k])
+    order = np.argsort(-features[:, 0], kind="mergesort")
+    order = order[_distinct(moved[order], places[0], places[1], count)]
+    moved, features = moved[order], features[order]
+    hessians = np.empty((len(order), 3, 3))
+    residuals = np.empty(len(order))
+    followed = spread(points, rays[0])
+    for k in range(len(order)):
+        features[k, 5] = (
+            passed_through(moved[k], followed, tiles, rays[1]) if k < rays[2] else np.nan
+        )
         hessian, _, squares, total = normal_equations(moved[k], few, tiles, 0.1)
         hessians[k] = hessian
         residuals[k] = squares / max(total, 1.0)
-    order = np.argsort(-features[:, 0], kind="mergesort")
-    return moved[order], features[order], hessians[order], residuals[order]
+    return moved, features, hessians, residuals
