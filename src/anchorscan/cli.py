@@ -17,6 +17,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from enum import Enum
 from functools import wraps
 from itertools import islice
@@ -39,6 +40,7 @@ if TYPE_CHECKING:
 __all__ = ["app", "main"]
 
 _FAILED = 1
+_MAP_SUFFIXES = (".yaml", ".yml")
 _PROGRESS_DELAY = 1.0
 _PROGRESS_INTERVAL = 0.1
 # How many malformed lines a message names before it says "and so on".
@@ -183,17 +185,20 @@ SettingsOption = Annotated[
 @_guarded
 def build(
     logs: Annotated[
-        list[Path], typer.Argument(metavar="LOG...", help="Logs of laser scans with poses.")
+        list[Path],
+        typer.Argument(metavar="LOG...", help="Logs of laser scans with poses, or one map.yaml."),
     ],
     output: Annotated[
         Path, typer.Option("--output", "-o", metavar="SET", help="The reference set to write.")
     ],
     spacing: Annotated[
-        float, typer.Option(min=0.0, metavar="M", help="Metres between references ...")
-    ] = 2.0,
+        float | None,
+        typer.Option(min=0.0, metavar="M", help="Metres between references (2; in a map 1.5) ..."),
+    ] = None,
     heading: Annotated[
-        float, typer.Option(min=0.0, max=180.0, metavar="DEG", help="... or degrees.")
-    ] = 45.0,
+        float | None,
+        typer.Option(min=0.0, max=180.0, metavar="DEG", help="... or degrees (45; in a map 90)."),
+    ] = None,
     keep_all: Annotated[bool, typer.Option("--all", help="Keep every scan with a pose.")] = False,
     field_of_view: FieldOfViewOption = None,
     range_max: RangeMaxOption = None,
@@ -218,21 +223,33 @@ def build(
     """Make a reference set from the scans of logs with poses.
 
     A scan becomes a reference when no reference lies within the spacing and the heading of it.
+    In a map (YAML beside PGM or PNG, as map_server has it), references are the scans that the
+    laser would take at places spread over all that a robot can reach: by default one that looks
+    all around, up to 30 m.
     """
     from .reference_set import ReferenceSet
 
     settings = _read_settings(preset, settings_file)
-    options = {
-        **_reading(field_of_view, range_max, topic, upside_down),
-        **{"poses": poses, "poses_of": poses_of.value, "T_base_laser": laser},
-    }
-    opened = [_open_log(log, options) for log in logs]
-    records = _progress(_records(*opened), "reading", _total(*opened))
+    is_map = any(log.suffix.lower() in _MAP_SUFFIXES for log in logs)
+    usual = (1.5, 90.0) if is_map else (2.0, 45.0)
+    spacing = usual[0] if spacing is None else spacing
+    heading = math.radians(usual[1] if heading is None else heading)
+    if is_map:
+        if len(logs) > 1 or topic or poses or laser or upside_down:
+            raise typer.BadParameter("a map is built from alone: no other logs, no topics or poses")
+        records = _map_records(logs[0], field_of_view, range_max, spacing, heading)
+    else:
+        options = {
+            **_reading(field_of_view, range_max, topic, upside_down),
+            **{"poses": poses, "poses_of": poses_of.value, "T_base_laser": laser},
+        }
+        opened = [_open_log(log, options) for log in logs]
+        records = _progress(_records(*opened), "reading", _total(*opened))
     with ReferenceSet.build(
         records,
         spacing=spacing,
-        heading=math.radians(heading),
-        keep_all=keep_all,
+        heading=heading,
+        keep_all=keep_all or is_map,  # coverage of a map is decided already
         settings=settings,
         path=output,
     ) as places:
@@ -416,6 +433,22 @@ class _Locator:
             "scan": record.index,
             "stamp": record.stamp,
             "seconds": round(seconds, _DECIMALS + 1),
+def _map_records(
+    path: Path, field_of_view: float | None, range_max: float | None, spacing: float, heading: float
+) -> Iterator[Record]:
+    """Take scans all over a map, with the laser that was named or one that looks all around."""
+    from .map_file import load_map
+    from .occupancy import MAP_SENSOR, reference_scans
+
+    sensor = MAP_SENSOR
+    if field_of_view is not None:
+        sensor = replace(sensor, field_of_view=math.radians(field_of_view))
+    if range_max is not None:
+        sensor = replace(sensor, range_max=range_max)
+    grid = load_map(path)
+    return _progress(reference_scans(grid, sensor, spacing=spacing, heading=heading), "simulating")
+
+
             "accepted": bool(hypotheses) and hypotheses[0].accepted,
             "hypotheses": [_hypothesis_line(hypothesis) for hypothesis in hypotheses],
         }

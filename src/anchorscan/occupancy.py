@@ -35,6 +35,7 @@ from .scan import LaserScan
 from .sensor import SensorModel
 
 __all__ = [
+    "MAP_SENSOR",
     "OccupancyGrid",
     "cast_rays",
     "reference_poses",
@@ -64,6 +65,9 @@ _HIT_SHARE = 0.25
 # The largest region of unknown cells that is taken for a gap between rays, square metres.
 _SPECK_AREA = 0.02
 _MOST_CELLS = 1 << 28
+
+MAP_SENSOR = SensorModel(2.0 * math.pi, math.radians(0.5), range_max=30.0)
+"""Takes the reference scans of a map unless another is given: all around, every half degree."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -322,8 +326,7 @@ def reference_scans(
 
     Args:
         grid: The map.
-        sensor: The laser scanner; by default one that looks all around, every half degree,
-            up to 30 m.  Its noise is left out.
+        sensor: The laser scanner; `MAP_SENSOR` by default.  Its noise is left out.
         spacing: As for `reference_poses`, metres.
         heading: Angle between the scans at one place, radians; a sensor that looks all
             around scans once.
@@ -337,7 +340,7 @@ def reference_scans(
     """
     if not 0.0 < heading < math.inf:
         raise LogError(f"the angle between reference scans must be positive, not {heading}")
-    sensor = sensor or SensorModel(2.0 * math.pi, math.radians(0.5), range_max=30.0)
+    sensor = sensor or MAP_SENSOR
     is_full = sensor.count * abs(sensor.angle_increment) > 2.0 * math.pi - 1.0e-9
     turns = 1 if is_full else math.ceil(2.0 * math.pi / heading - 1.0e-9)
     places = reference_poses(grid, spacing=spacing, radius=radius)
