@@ -528,7 +528,7 @@ def test_ctrl_c_ends_a_run_quietly(log: Path, places: Path, processes: str) -> N
         assert process.stdout is not None
         process.stdout.readline()
         os.killpg(process.pid, signal.SIGINT)  # the terminal tells every process of the group
-        _, err = process.communicate(timeout=60)
+        _, err = process.communicate(timeout=300)
     assert (process.returncode, Outcome(130, "", err).messages) == (130, [])
 
 

@@ -190,11 +190,10 @@ def draw(outcome: Demonstration) -> Figure:
     _require_matplotlib()
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(10.4, 5.6), dpi=130, layout="constrained", facecolor="white")
-    grid = figure.add_gridspec(2, 2, width_ratios=(1.9, 1.0))
+    figure = Figure(figsize=(10.4, 5.7), dpi=130, layout="constrained", facecolor="white")
+    grid = figure.add_gridspec(2, 2, width_ratios=(1.72, 1.0))
     _draw_map(figure.add_subplot(grid[:, 0]), outcome)
-    shown = _to_show(outcome)
-    for row, (one, title) in enumerate(shown):
+    for row, (one, title) in enumerate(_to_show(outcome)):
         _draw_match(figure.add_subplot(grid[row, 1]), outcome, one, title)
     return figure
 
@@ -226,7 +225,7 @@ def _draw_map(axes: Axes, outcome: Demonstration) -> None:
 
     walls = np.concatenate([_walls(each.scan, each.pose) for each in outcome.places.references])
     axes.plot(*walls.T, ",", color=_WALL, alpha=0.35, zorder=1)
-    axes.plot(*_places(unknown), "o", ms=3.2, mfc="none", mec=_UNKNOWN, mew=0.7, zorder=2)
+    axes.plot(*_places(unknown), "o", ms=2.6, mfc="none", mec=_UNKNOWN, mew=0.6, zorder=2)
     axes.plot(*_places(right), "o", ms=3.2, color=_RIGHT, mec="none", zorder=3)
     for each in wrong:
         ends = [pose for pose in (each.answer.truth, each.answer.pose) if pose is not None]
@@ -239,19 +238,16 @@ def _draw_map(axes: Axes, outcome: Demonstration) -> None:
     axes.set_ylim(min(y) - _MARGIN, max(y) + _MARGIN)
     _frame(axes)
     axes.set_title(
-        f"{len(located)} scans of later visits, each located on its own "
-        f"among {len(poses)} reference scans",
-        fontsize=10,
+        f"{len(located)} scans of later visits, located one by one among {len(poses)} references",
+        fontsize=9,
         loc="left",
     )
     handles = [
         _mark("o", _RIGHT, f"located and correct: {len(right)}", filled=True),
-        _mark("X", _WRONG, f"located and wrong (line to the answer): {len(wrong)}", True),
+        _mark("X", _WRONG, f"located and wrong: {len(wrong)}", True),
         _mark("o", _UNKNOWN, f"“not known”: {len(unknown)}", filled=False),
     ]
-    axes.legend(
-        handles=handles, loc="upper center", bbox_to_anchor=(0.5, -0.01), ncols=3, frameon=False
-    )
+    axes.legend(handles=handles, loc="upper left", fontsize=9, frameon=False)
 
 
 def _draw_match(axes: Axes, outcome: Demonstration, shown: Located, title: str) -> None:
@@ -279,11 +275,11 @@ def _to_show(outcome: Demonstration) -> list[tuple[Located, str]]:
     chosen = []
     if hits:
         best = max(hits, key=_interest)
-        chosen.append((best, "Located: the scan (dots) over its reference (squares)"))
+        chosen.append((best, "Located: the scan (blue) over its reference (grey)"))
     if misses:
         best = max(misses, key=lambda each: each.answer.probability)
         away = best.answer.position_error
-        chosen.append((best, f"“Not known”, rightly: this look-alike is {away:.0f} m away"))
+        chosen.append((best, f"“Not known”: this look-alike is {away:.0f} m away"))
     return chosen
 
 
