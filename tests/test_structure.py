@@ -25,6 +25,7 @@ ORDER = (
     *("description", "pairwise", "stitched_map", "matcher"),
     *("set_file", "set_directory", "reference_set", "localizer"),
     *("sensor", "occupancy", "map_file", "world", "building", "simulator", "exhaustive_search"),
+    *("karto_matcher", "stage_times", "scoreboard"),
 )
 VALUES = {"errors", "pose", "scan", "record", "reference"}
 # Imported by nobody, but for the command line, which loads them inside its commands.

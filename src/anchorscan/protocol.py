@@ -35,6 +35,7 @@ __all__ = [
     "choose_references",
     "figures",
     "lost_robot",
+    "precision_recall",
     "recall_at_precision",
     "reliability",
     "revisit",
@@ -345,6 +346,25 @@ def thin(queries: Sequence[int], count: int | None, seed: int = 0) -> tuple[int,
     return tuple(queries[step] for step in steps)
 
 
+def precision_recall(
+    probability: ArrayLike, correct: ArrayLike
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Return the curve over all thresholds, from the strictest to none.
+
+    Answers of equal probability are given or withheld together.
+
+    Args:
+        probability: (N,) reported for each query; NaN where nothing was answered.
+        correct: (N,) whether the answer is correct.
+
+    Returns:
+        (T,) thresholds, falling; (T,) share of the answers at or above each that are correct;
+        (T,) share of all queries answered correctly.
+    """
+    thresholds, given, hits = _counts(probability, correct)
+    return thresholds, hits / given, hits / max(np.size(probability), 1)
+
+
 def recall_at_precision(
     probability: ArrayLike, correct: ArrayLike, precision: float = 1.0
 ) -> tuple[float, float]:
@@ -361,17 +381,12 @@ def recall_at_precision(
         The share of all queries answered correctly, and the threshold (answers at or above it
         are given); 0 and infinity when no threshold will do.
     """
-    values = np.asarray(probability, dtype=np.float64)
-    right = np.asarray(correct, dtype=bool)
-    answered = ~np.isnan(values)
-    thresholds, group = np.unique(-values[answered], return_inverse=True)
-    hits = np.cumsum(np.bincount(group, weights=right[answered], minlength=len(thresholds)))
-    given = np.cumsum(np.bincount(group, minlength=len(thresholds)))
+    thresholds, given, hits = _counts(probability, correct)
     allowed = np.flatnonzero(given - hits <= (1.0 - precision) * given + _SLACK)
     if not allowed.size or hits[allowed].max() == 0:
         return 0.0, math.inf
     best = allowed[np.argmax(hits[allowed])]
-    return float(hits[best]) / len(values), float(-thresholds[best])
+    return float(hits[best]) / np.size(probability), float(thresholds[best])
 
 
 def reliability(probability: ArrayLike, correct: ArrayLike) -> Reliability:
@@ -431,6 +446,19 @@ def figures(answers: Iterable[Answer]) -> Figures:
         heading_90=_percentile(heading, 90),
         honest_covariance=_share_below(squared, _CHI_SQUARE_95),
     )
+
+
+def _counts(
+    probability: ArrayLike, correct: ArrayLike
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Return (T,) thresholds, falling, and (T,) answers and correct answers at or above each."""
+    values = np.asarray(probability, dtype=np.float64)
+    right = np.asarray(correct, dtype=bool)
+    answered = ~np.isnan(values)
+    falling, group = np.unique(-values[answered], return_inverse=True)
+    given = np.cumsum(np.bincount(group, minlength=len(falling))).astype(np.float64)
+    hits = np.cumsum(np.bincount(group[right[answered]], minlength=len(falling)))
+    return -falling, given, hits.astype(np.float64)
 
 
 def _poses(records: Sequence[Record]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
