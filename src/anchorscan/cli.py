@@ -327,6 +327,70 @@ def info(
 
 @app.command()
 @_guarded
+def bench(
+    logs: Annotated[
+        list[str] | None,
+        typer.Argument(
+            metavar="[BUILDING=]LOG...", help="Logs with poses; those in ANCHORSCAN_DATA if none."
+        ),
+    ] = None,
+    presets: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--preset", parser=_parse_preset, metavar="PRESET", help="Again for more presets."
+        ),
+    ] = None,
+    protocols: Annotated[
+        list[str] | None,
+        typer.Option("--protocol", metavar="P1..P4", help="Again for more; all if none is named."),
+    ] = None,
+    candidates: Annotated[
+        list[Any] | None,
+        typer.Option(
+            parser=_parse_candidates,
+            metavar="K|all",
+            help="Again for more; the preset's own number, 1, 5 and all if none is named.",
+        ),
+    ] = None,
+    output: Annotated[
+        Path | None,
+        typer.Option("--output", "-o", metavar="DIR", help="Folder for tables and pictures."),
+    ] = None,
+    queries: Annotated[
+        int | None, typer.Option(min=1, metavar="N", help="At most so many queries of each split.")
+    ] = None,
+    baselines: Annotated[
+        list[str] | None,
+        typer.Option("--baseline", metavar="NAME", help="exhaustive, karto or none; all."),
+    ] = None,
+    baseline_queries: Annotated[
+        int, typer.Option(min=1, metavar="N", help="The same for the baselines, which are slow.")
+    ] = 136,
+    seed: Annotated[int, typer.Option(help="Chooses the queries, where not all are asked.")] = 0,
+) -> None:
+    """Measure how well and how fast scans are located, by fixed protocols.
+
+    Logs of one building, given one after the other as BUILDING=LOG, are two sessions.
+    """
+    from .benchmark import BASELINES, PROTOCOLS, run
+
+    run(
+        logs or (),
+        presets=presets or ("default",),
+        protocols=protocols or PROTOCOLS,
+        candidates=candidates or (None, 1, 5, "all"),
+        output_folder=output,
+        queries=queries,
+        seed=seed,
+        baselines=() if baselines == ["none"] else baselines or BASELINES,
+        baseline_queries=baseline_queries,
+        say=typer.echo,
+        progress=_progress,
+    )
+
+
+@app.command()
+@_guarded
 def demo(
     output: Annotated[
         Path, typer.Option("--output", "-o", metavar="DIR", help="Folder for the pictures.")
@@ -367,6 +431,22 @@ def _records(*logs: Log) -> Iterator[Record]:
             _say(f"note: {log.path}: {note}")
         yield from log
         _report_problems(log)
+
+
+def _map_records(
+    path: Path, field_of_view: float | None, range_max: float | None, spacing: float, heading: float
+) -> Iterator[Record]:
+    """Take scans all over a map, with the laser that was named or one that looks all around."""
+    from .map_file import load_map
+    from .occupancy import MAP_SENSOR, reference_scans
+
+    sensor = MAP_SENSOR
+    if field_of_view is not None:
+        sensor = replace(sensor, field_of_view=math.radians(field_of_view))
+    if range_max is not None:
+        sensor = replace(sensor, range_max=range_max)
+    grid = load_map(path)
+    return _progress(reference_scans(grid, sensor, spacing=spacing, heading=heading), "simulating")
 
 
 def _total(*logs: Log) -> int | None:
@@ -433,22 +513,6 @@ class _Locator:
             "scan": record.index,
             "stamp": record.stamp,
             "seconds": round(seconds, _DECIMALS + 1),
-def _map_records(
-    path: Path, field_of_view: float | None, range_max: float | None, spacing: float, heading: float
-) -> Iterator[Record]:
-    """Take scans all over a map, with the laser that was named or one that looks all around."""
-    from .map_file import load_map
-    from .occupancy import MAP_SENSOR, reference_scans
-
-    sensor = MAP_SENSOR
-    if field_of_view is not None:
-        sensor = replace(sensor, field_of_view=math.radians(field_of_view))
-    if range_max is not None:
-        sensor = replace(sensor, range_max=range_max)
-    grid = load_map(path)
-    return _progress(reference_scans(grid, sensor, spacing=spacing, heading=heading), "simulating")
-
-
             "accepted": bool(hypotheses) and hypotheses[0].accepted,
             "hypotheses": [_hypothesis_line(hypothesis) for hypothesis in hypotheses],
         }
