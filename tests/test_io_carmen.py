@@ -138,8 +138,8 @@ def test_a_robotlaser_line_carries_its_own_geometry(
     path.write_text(" ".join(map(str, words)))
     (record,) = read(path)
     assert record.scan is not None
-    expected = np.where(ranges >= limit, np.inf, ranges)
-    np.testing.assert_array_equal(record.scan.ranges, expected.astype(np.float32))
+    expected = np.where(ranges.astype(float) >= limit, np.float32(np.inf), ranges)
+    np.testing.assert_array_equal(record.scan.ranges, expected)
     assert (record.scan.angle_min, record.scan.angle_increment) == (start, step)
     assert record.stamp == 77.5
     assert record.T_base_laser is not None

@@ -139,7 +139,7 @@ def make_scan(
     if range_max is None:
         free |= _is_lms_code(values)
     return LaserScan(
-        np.where(free, np.inf, values).astype(np.float32),
+        np.where(free, np.inf, values),
         geometry.angle_min,
         geometry.angle_increment,
         geometry.range_min,

@@ -16,8 +16,6 @@ Without angles the geometry follows from the number of readings, as for a CARMEN
 from __future__ import annotations
 
 import math
-import zipfile
-import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -31,6 +29,7 @@ from ..errors import LogError, ScanError
 from ..pose import Pose2D
 from ..record import Record
 from ..scan import LaserScan
+from .archive import BROKEN, ZIP_MAGIC, member_names, open_archive
 from .bounded_file import BoundedPath
 from .geometry import RANGE_MAX, ScanGeometry, geometry_of, make_scan, spread
 from .log import Log, Report
@@ -41,7 +40,6 @@ _MAGIC = b"\x93NUMPY"
 _POSE_LENGTH = 3
 _DIMENSIONS = 2
 _CHUNK = 1 << 20
-_BROKEN = (OSError, EOFError, ValueError, zipfile.BadZipFile, zlib.error, RuntimeError)
 _SIDE_ARRAYS = (
     "poses",
     "odometry",
@@ -58,14 +56,10 @@ def is_numpy(path: Path, magic: bytes) -> bool:
     """Tell whether a file is ``.npy``, or a zip archive of such files."""
     if magic.startswith(_MAGIC):
         return True
-    if not magic.startswith(b"PK"):
+    if not magic.startswith(ZIP_MAGIC):
         return False
-    try:
-        with zipfile.ZipFile(path) as archive:
-            names = archive.namelist()
-    except _BROKEN:
-        return path.suffix == ".npz"
-    return path.suffix == ".npz" or (bool(names) and all(one.endswith(".npy") for one in names))
+    names = member_names(path)
+    return bool(names) and all(name.endswith(".npy") for name in names)
 
 
 @dataclass(frozen=True)
@@ -190,7 +184,7 @@ class NumpyLog(Log):
             for index in range(rows):
                 try:
                     data = _read_all(stream, size)
-                except _BROKEN as error:
+                except BROKEN as error:
                     report(index + 1, f"the file is damaged from here on: {error}")
                     return
                 if len(data) < size:
@@ -210,11 +204,7 @@ class NumpyLog(Log):
             yield row.astype(np.float64)
 
     def _members(self) -> set[str]:
-        try:
-            with zipfile.ZipFile(self.path) as archive:
-                return {name.removesuffix(".npy") for name in archive.namelist()}
-        except _BROKEN as error:
-            raise LogError(f"the archive cannot be read: {error}", self.path) from None
+        return {name.removesuffix(".npy") for name in member_names(self.path)}
 
     @contextmanager
     def _stream(self, name: str) -> Iterator[IO[bytes]]:
@@ -223,13 +213,13 @@ class NumpyLog(Log):
                 with BoundedPath(self.path).open("rb") as stream:
                     yield stream
                 return
-            with zipfile.ZipFile(self.path) as archive:
+            with open_archive(self.path) as archive:
                 if f"{name}.npy" not in archive.namelist():
                     held = ", ".join(sorted(archive.namelist())[:8]) or "nothing"
                     raise LogError(f"no array named {name!r}; it holds {held}", self.path)
                 with archive.open(f"{name}.npy") as member:
                     yield member
-        except _BROKEN as error:
+        except BROKEN as error:
             raise LogError(f"cannot be read: {error}", self.path) from None
 
     def _header(self, stream: IO[bytes], name: str) -> _Header:
@@ -240,12 +230,17 @@ class NumpyLog(Log):
                 (2, 0): np.lib.format.read_array_header_2_0,
             }[version]
             shape, is_fortran, dtype = read(stream)
-        except (KeyError, ValueError, SyntaxError) as error:
-            reason = str(error).strip().splitlines()[0] if str(error).strip() else "no header"
-            raise LogError(f"{name} is no NumPy array: {reason}", self.path) from None
+        except BROKEN as error:
+            raise LogError(f"{name} is no NumPy array: {_first_line(error)}", self.path) from None
+        except Exception:  # NumPy parses the header as Python, which raises anything
+            raise LogError(f"{name} has no NumPy header that can be read", self.path) from None
         if dtype.kind not in "fiu":
             raise LogError(f"{name} must hold numbers, not {dtype}", self.path)
         return _Header(shape, is_fortran, dtype)
+
+
+def _first_line(error: Exception) -> str:
+    return next(iter(str(error).strip().splitlines()), type(error).__name__)
 
 
 def _begins(path: Path) -> bool:

@@ -63,8 +63,11 @@ class Survey:
 
     @property
     def relative(self) -> Pose2D | None:
-        """``T_base_laser`` as the two columns have it, where they are one trajectory."""
-        return self._relative if self.is_one_trajectory else None
+        """``T_base_laser`` as the columns have it, where they are one trajectory of two bodies."""
+        if not self.is_one_trajectory or self._relative is None:
+            return None
+        # Two equal columns may be those of one body as well as of two that coincide.
+        return None if _is_same(self._relative, Pose2D()) else self._relative
 
     @property
     def has_poses(self) -> bool:

@@ -7,8 +7,6 @@ Nothing here holds more than one line, and no line longer than `_LONGEST_LINE`.
 from __future__ import annotations
 
 import gzip
-import zipfile
-import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -16,20 +14,17 @@ from pathlib import Path, PurePosixPath
 from typing import IO, cast
 
 from ..errors import LogError
+from .archive import BROKEN, ZIP_MAGIC, member_names, open_archive
 from .log import Report
 
 __all__ = ["TextFile", "find_text", "shown"]
 
 GZIP_MAGIC = b"\x1f\x8b"
-ZIP_MAGIC = b"PK\x03\x04"
 
 # A scan of a hundred thousand readings fits; a binary file without line ends is cut off here.
 _LONGEST_LINE = 1 << 22
 _BYTE_ORDER_MARK = b"\xef\xbb\xbf"
 _SHOWN = 24
-
-# What gzip and zip raise on data that stops or was altered.
-_BROKEN = (EOFError, zlib.error, gzip.BadGzipFile, zipfile.BadZipFile, OSError)
 
 
 def shown(word: bytes) -> str:
@@ -69,7 +64,7 @@ class TextFile:
         """
         try:
             if self.compression == "zip":
-                with zipfile.ZipFile(self.path) as archive, archive.open(self.member) as stream:
+                with open_archive(self.path) as archive, archive.open(self.member) as stream:
                     yield stream
             elif self.compression == "gzip":
                 with gzip.open(self.path, "rb") as stream:
@@ -77,7 +72,7 @@ class TextFile:
             else:
                 with self.path.open("rb") as stream:
                     yield stream
-        except (*_BROKEN, RuntimeError) as error:  # RuntimeError: a zip that wants a password
+        except BROKEN as error:
             raise LogError(f"cannot be read: {error}", self.path) from None
 
     def head(self, size: int) -> bytes:
@@ -87,7 +82,7 @@ class TextFile:
             try:
                 while len(pieces) < size and (piece := stream.read(min(size, 1 << 16))):
                     pieces += piece
-            except _BROKEN as error:
+            except BROKEN as error:
                 if not pieces:
                     raise LogError(f"cannot be read: {error}", self.path) from None
         return bytes(pieces[:size])
@@ -109,7 +104,7 @@ class TextFile:
                         while len(stream.readline(_LONGEST_LINE)) == _LONGEST_LINE:
                             pass
                         continue
-                except _BROKEN as error:
+                except BROKEN as error:
                     report(number, f"the file is damaged or cut off here: {error}")
                     return
                 if not line:
@@ -130,11 +125,7 @@ def find_text(path: Path, magic: bytes) -> TextFile:
         return TextFile(path, "gzip")
     if not magic.startswith(ZIP_MAGIC):
         return TextFile(path)
-    try:
-        with zipfile.ZipFile(path) as archive:
-            names = [name for name in archive.namelist() if _is_member(name)]
-    except _BROKEN as error:
-        raise LogError(f"the zip archive cannot be read: {error}", path) from None
+    names = [name for name in member_names(path) if _is_visible(name)]
     if len(names) != 1:
         held = ", ".join(names[:5]) + (", ..." if len(names) > 5 else "")
         problem = f"holds several files ({held}); unpack the one you mean" if names else "is empty"
@@ -142,8 +133,7 @@ def find_text(path: Path, magic: bytes) -> TextFile:
     return TextFile(path, "zip", names[0])
 
 
-def _is_member(name: str) -> bool:
+def _is_visible(name: str) -> bool:
     parts = PurePosixPath(name).parts
     # macOS adds a shadow of every file under this name.
-    hidden = "__MACOSX" in parts or (parts and parts[-1].startswith("."))
-    return bool(parts) and not name.endswith("/") and not hidden
+    return bool(parts) and "__MACOSX" not in parts and not parts[-1].startswith(".")
