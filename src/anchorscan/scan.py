@@ -64,9 +64,7 @@ class LaserScan:
         if abs(self.angle_increment) * len(ranges) > 4.0 * math.pi:
             raise ScanError("the readings span more than two turns; is angle_increment in degrees?")
         if not 0.0 <= self.range_min < self.range_max:
-            raise ScanError(
-                f"range limits are out of order: {self.range_min} to {self.range_max}"
-            )
+            raise ScanError(f"range limits are out of order: {self.range_min} to {self.range_max}")
         ranges.setflags(write=False)
         object.__setattr__(self, "ranges", ranges)
         for name in ("angle_min", "angle_increment", "range_min", "range_max"):
