@@ -7,9 +7,16 @@ import os
 from collections.abc import Callable
 from pathlib import Path
 
+import hypothesis
 import pytest
 
 from anchorscan import Record
+
+# No test measures time, and the first example of one may wait for a kernel to be compiled.
+hypothesis.settings.register_profile(
+    "anchorscan", deadline=None, derandomize=bool(os.environ.get("CI")), print_blob=True
+)
+hypothesis.settings.load_profile("anchorscan")
 
 DATA = Path(
     os.environ.get(
