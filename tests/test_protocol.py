@@ -15,7 +15,7 @@ from anchorscan.protocol import (
     Answer,
     choose_references,
     figures,
-    lost_robot,
+    precision_recall,
     recall_at_precision,
     reliability,
     revisit,
@@ -151,11 +151,6 @@ def test_unknown_place_asks_every_usable_scan_posed_or_not():
     assert (split.references, split.queries) == ((0,), (0, 2))
 
 
-def test_lost_robot_starts_at_every_twentieth_usable_scan():
-    records = [Record(i, None if i == 0 else SCAN, Pose2D()) for i in range(50)]
-    assert lost_robot(records) == (1, 21, 41)
-
-
 @given(st.integers(0, 200), st.integers(0, 250), st.integers(0, 5))
 def test_thinning_keeps_order_and_count(total, count, seed):
     taken = thin(range(total), count, seed)
@@ -204,6 +199,25 @@ def test_ties_at_the_threshold_count_together():
     probability = [0.9, 0.8, 0.8, 0.8, 0.7]
     correct = [True, True, False, True, True]
     assert recall_at_precision(probability, correct) == (0.2, 0.9)
+
+
+@given(
+    st.lists(
+        st.tuples(st.sampled_from([0.1, 0.5, 0.9, math.nan]), st.booleans()),
+        min_size=1,
+        max_size=40,
+    )
+)
+def test_the_curve_holds_every_threshold_once(pairs):
+    probability, correct = (list(values) for values in zip(*pairs, strict=True))
+    thresholds, precision, recall = precision_recall(probability, correct)
+    assert thresholds.tolist() == sorted(
+        {p for p in probability if not math.isnan(p)}, reverse=True
+    )
+    for threshold, p, r in zip(thresholds, precision, recall, strict=True):
+        given_answers = [c for q, c in pairs if q >= threshold]
+        assert p == given_answers.count(True) / len(given_answers)
+        assert r == given_answers.count(True) / len(pairs)
 
 
 def test_one_wrong_of_a_hundred_is_one_per_cent():

@@ -19,7 +19,7 @@ ROOT = PACKAGE.parents[1]
 # In the order of the data flow: a file imports only files that stand before it.  A new file
 # gets its place here; one that fits nowhere is a sign that it does two things.
 ORDER = (
-    *("errors", "pose", "scan", "record", "reference", "protocol", "_jit"),
+    *("errors", "pose", "scan", "record", "reference", "protocol", "journey", "_jit"),
     *("angle_function", "segments", "anchors", "graph", "database", "alignment"),
     *("field", "proposal", "verification", "evaluation", "hypothesis", "decision", "settings"),
     *("description", "pairwise", "stitched_map", "matcher"),
@@ -30,7 +30,7 @@ ORDER = (
 VALUES = {"errors", "pose", "scan", "record", "reference"}
 # Imported by nobody, but for the command line, which loads them inside its commands.
 LEAVES = {
-    *("benchmark", "report", "figures", "viewer", "demo", "ros_node", "cli"),
+    *("benchmark", "report", "figures", "viewer", "demo", "map_check", "ros_node", "cli"),
     "__main__",
 }
 SILENT = {"print", "exit", "quit", "breakpoint", "input"}

@@ -6,7 +6,7 @@ Five protocols split recorded drives; none of them looks at a reading, only at p
 * P2, ``sparse``: as P1 with about thirty references, the setting of section 6 of the paper.
 * P3, ``two_sessions``: references from one drive, queries from an independent one.
 * P4, ``unknown_place``: references from one building, queries from another; every answer is wrong.
-* P5, ``lost_robot``: a drive from many starting points, for a belief over time.
+* P5, a drive from many starting points, for a belief over time, is in ``journey.py``.
 
 An answer is *correct* within 0.5 m **and** 10 degrees of the true pose.  Section 6 of the paper
 counts correct and wrong answers at one threshold; recall at full precision and the calibration
@@ -34,7 +34,6 @@ __all__ = [
     "Split",
     "choose_references",
     "figures",
-    "lost_robot",
     "precision_recall",
     "recall_at_precision",
     "reliability",
@@ -318,12 +317,6 @@ def unknown_place(
     """
     usable = tuple(i for i, record in enumerate(queries) if record.scan is not None)
     return Split(choose_references(references, spacing, heading), usable, spacing, heading)
-
-
-def lost_robot(records: Sequence[Record], every: int = 20) -> tuple[int, ...]:
-    """Return the starting points of P5: every ``every``-th usable record with a pose."""
-    usable = np.flatnonzero(_poses(records)[1])
-    return tuple(int(position) for position in usable[::every])
 
 
 def thin(queries: Sequence[int], count: int | None, seed: int = 0) -> tuple[int, ...]:
