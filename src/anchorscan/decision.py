@@ -39,14 +39,14 @@ class DecisionSettings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    constant: float = Field(1.3, description="of the logistic function")
-    log_margin: float = Field(1.8, description="weight of the logarithm of the margin")
-    margin: float = Field(-10.0, description="weight of the margin")
-    explained: float = Field(2.5, description="weight of -log(1 - score)")
-    through: float = Field(-6.5, description="weight of the share of rays that see through")
+    constant: float = Field(-0.81, description="of the logistic function")
+    log_margin: float = Field(1.57, description="weight of the logarithm of the margin")
+    margin: float = Field(-8.88, description="weight of the margin")
+    explained: float = Field(3.22, description="weight of -log(1 - score)")
+    through: float = Field(-5.44, description="weight of the share of rays that see through")
     rivalry: float = Field(30.0, gt=0.0, description="of the fits for what the best leaves")
     elsewhere: float = Field(0.8, description="score with which 'somewhere else' competes")
-    threshold: float = Field(0.9, gt=0.0, le=1.0, description="probability that is an answer")
+    threshold: float = Field(0.95, gt=0.0, le=1.0, description="probability that is an answer")
     range_deviation: float = Field(
         0.03, gt=0.0, description="least standard deviation of a reading, metres"
     )
