@@ -391,6 +391,31 @@ def bench(
 
 @app.command()
 @_guarded
+def check_map(
+    map_file: Annotated[Path, typer.Argument(metavar="MAP", help="YAML file of a map.")],
+    log: LogArgument,
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", metavar="DIR", help="Folder for a picture.")
+    ] = None,
+    topic: TopicOption = None,
+    upside_down: UpsideDownOption = False,
+    range_max: RangeMaxOption = None,
+    preset: PresetOption = None,
+    settings_file: SettingsOption = None,
+) -> None:
+    """Say how well the scans of a drive are located in a map, without any truth.
+
+    Answers that are right move as the odometry of the log does.
+    """
+    from .map_check import run
+
+    settings = _read_settings(preset, settings_file)
+    opened = _open_log(log, _reading(None, range_max, topic, upside_down))
+    run(map_file, opened, output, settings, say=typer.echo, progress=_progress)
+
+
+@app.command()
+@_guarded
 def demo(
     output: Annotated[
         Path, typer.Option("--output", "-o", metavar="DIR", help="Folder for the pictures.")
