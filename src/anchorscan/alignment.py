@@ -9,7 +9,7 @@ ways: a on v and b on w, or a on w and b on v.  Which of them are true is decide
    would lay on one another; both assignments of an edge pair count.
 3. Each edge correspondence behind the matrix's maximum gives one alignment hypothesis.
    The maximum says which assignment is meant.
-4. A clustering step eliminates the false ones, and the centre of gravity of the rest (mean
+4. A clustering step eliminates the false ones, and the centre of gravity of the true ones (mean
    translation, circular mean rotation) is the alignment.
 
 Several peaks of the histogram and of the matrix give several alignments.  All steps handle
@@ -18,6 +18,12 @@ all candidate references in one call, over arrays laid one behind the other.
 The paper leaves the clustering open.  Here the hypothesis around which the others lie most
 densely is the first centre; what is farther from it than three times the median distance of
 what is close is false; and the same once more around the mean.
+
+We depart from the paper in one point: the centre of gravity is taken over all edge
+correspondences that mean the alignment, not only over those behind the maximum.  These all
+share one pair of nodes, and with it that pair's error: where two anchor points of a corner lie
+a few centimetres apart the maximum may name the wrong one, and one scan in thirty was not laid
+exactly on itself.
 """
 
 from __future__ import annotations
@@ -104,11 +110,11 @@ class Alignment:
         maxima: (G, 3) row, column and value of the maxima; value 0 where there are fewer.
         contributions: (H, 3) x, y, theta of every hypothesis before clustering.
         contribution_starts: (G + 1,) where those of each group begin.
-        in_cluster: (H,) whether the clustering step kept it.
+        in_cluster: (H,) whether the clustering step kept it for the centre of its group.
         candidates: (N,) candidate of every alignment; the strongest first in each candidate.
         poses: (N, 3) ``T_reference_scan`` as x, y, theta, metres and radians.
-        support: (N,) hypotheses in the cluster.
-        scatter: (N, 3, 3) covariance of x, y, theta within the cluster.
+        support: (N,) edge correspondences that mean it.
+        scatter: (N, 3, 3) covariance of x, y, theta among their hypotheses.
     """
 
     correspondences: Correspondences
@@ -175,11 +181,24 @@ def align(graph: AnchorGraph, references: GraphStack, settings: AlignmentSetting
         references.node_starts,
         graph.anchors.positions,
     )
-    unified, support, scatter, in_cluster = _unify(
-        contributions, starts, settings.cluster_distance, settings.cluster_turn
+    size = (settings.cluster_distance, settings.cluster_turn)
+    centres, in_cluster = _clusters(contributions, starts, size)
+    branches = np.arange(len(maxima)) // settings.matrix_peaks
+    sizes = np.diff(starts)
+    distinct = _distinct(centres, sizes, branches // settings.histogram_peaks, size)
+    branches = branches[distinct]
+    poses, support, scatter = _unified(
+        nodes,
+        kept_starts,
+        references.positions,
+        references.node_starts,
+        graph.anchors.positions,
+        centres[distinct],
+        branches,
+        size,
     )
-    groups = settings.histogram_peaks * settings.matrix_peaks
-    distinct = _distinct(unified, support, groups, settings.cluster_distance, settings.cluster_turn)
+    candidates = branches // settings.histogram_peaks
+    distinct = _distinct(poses, support, candidates, size)
     return Alignment(
         pairs,
         histograms,
@@ -193,8 +212,8 @@ def align(graph: AnchorGraph, references: GraphStack, settings: AlignmentSetting
         contributions,
         starts,
         in_cluster,
-        distinct // groups,
-        unified[distinct],
+        candidates[distinct],
+        poses[distinct],
         support[distinct],
         scatter[distinct],
     )
@@ -408,44 +427,85 @@ def _turn(angle):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _unify(poses, starts, distance, turn):  # type: ignore[no-untyped-def]
-    """Cluster the hypotheses of each group; mean, size, scatter and membership of the cluster."""
+def _clusters(poses, starts, size):  # type: ignore[no-untyped-def]
+    """Cluster the hypotheses of each group: centre, and membership of the hypotheses."""
     groups = len(starts) - 1
-    unified = np.zeros((groups, 3))
-    support = np.zeros(groups, np.int64)
-    scatter = np.zeros((groups, 3, 3))
+    centres = np.zeros((groups, 3))
     member = np.zeros(len(poses), np.bool_)
     for g in range(groups):
         group = poses[starts[g] : starts[g + 1]]
         inside = member[starts[g] : starts[g + 1]]
-        if len(group) == 0:
-            continue
-        mean = unified[g]
-        mean[:] = group[_densest(group, distance, turn)]
-        for _ in range(2):
-            _gather(group, mean, distance, turn, inside)
-            support[g] = _centre(group, inside, mean)
-        _spread(group, inside, mean, scatter[g])
-    return unified, support, scatter, member
+        if len(group) > 0:
+            centres[g] = group[_densest(group, size)]
+            for _ in range(2):
+                _gather(group, centres[g], size, inside)
+                _centre(group, inside, centres[g])
+    return centres, member
 
 
 @kernel
-def _apart(pose, other, distance, turn):  # type: ignore[no-untyped-def]
+def _unified(nodes, kept_starts, positions, node_starts, points, centres, branches, size):  # type: ignore[no-untyped-def]
+    """Centre of gravity of all correspondences that mean each alignment; number, scatter."""
+    peaks = max((len(kept_starts) - 1) // max(len(node_starts) - 1, 1), 1)
+    unified = centres.copy()
+    support = np.zeros(len(centres), np.int64)
+    scatter = np.zeros((len(centres), 3, 3))
+    for n in range(len(centres)):
+        begin, end = kept_starts[branches[n]], kept_starts[branches[n] + 1]
+        offset = node_starts[branches[n] // peaks]
+        group = _agreeing(nodes[begin:end], positions[offset:], points, centres[n], size)
+        if len(group) == 0:
+            continue
+        inside = np.zeros(len(group), np.bool_)
+        mean = unified[n]
+        for k in range(3):
+            mean[k] = np.median(group[:, k])
+        for _ in range(2):
+            _gather(group, mean, size, inside)
+            support[n] = _centre(group, inside, mean)
+        _spread(group, inside, mean, scatter[n])
+        mean[2] = _turn(mean[2])
+    return unified, support, scatter
+
+
+@kernel
+def _agreeing(nodes, positions, points, centre, size):  # type: ignore[no-untyped-def]
+    """The hypotheses of edge pairs that are close to a centre; theta not wrapped, near its."""
+    group = np.empty((len(nodes), 3))
+    found = 0
+    cos, sin = math.cos(centre[2]), math.sin(centre[2])
+    for pair in range(len(nodes)):
+        a, b = positions[nodes[pair, 0]], positions[nodes[pair, 1]]
+        v, w = points[nodes[pair, 2]], points[nodes[pair, 3]]
+        # Of the two assignments only the one that turns about as the centre can be close.
+        dx, dy, ex, ey = b[0] - a[0], b[1] - a[1], w[0] - v[0], w[1] - v[1]
+        along = cos * (ex * dx + ey * dy) + sin * (ex * dy - ey * dx)
+        x, y, theta = _lay(a, b, v, w) if along >= 0.0 else _lay(a, b, w, v)
+        group[found, 0] = x
+        group[found, 1] = y
+        group[found, 2] = centre[2] + _turn(theta - centre[2])
+        if _apart(group[found], centre, size) <= 1.0:
+            found += 1
+    return group[:found]
+
+
+@kernel
+def _apart(pose, other, size):  # type: ignore[no-untyped-def]
     """Squared distance of two alignments; one is the border of what belongs together."""
-    dx, dy = (pose[0] - other[0]) / distance, (pose[1] - other[1]) / distance
-    dt = _turn(pose[2] - other[2]) / turn
+    dx, dy = (pose[0] - other[0]) / size[0], (pose[1] - other[1]) / size[0]
+    dt = _turn(pose[2] - other[2]) / size[1]
     return dx * dx + dy * dy + dt * dt
 
 
 @kernel
-def _densest(group, distance, turn):  # type: ignore[no-untyped-def]
+def _densest(group, size):  # type: ignore[no-untyped-def]
     """Index of the hypothesis around which the others lie most densely."""
     highest = 0.0
     densest = 0
     for i in range(len(group)):
         density = 0.0
         for j in range(len(group)):
-            density += max(0.0, 1.0 - _apart(group[j], group[i], distance, turn))
+            density += max(0.0, 1.0 - _apart(group[j], group[i], size))
         if density > highest:
             highest = density
             densest = i
@@ -453,12 +513,12 @@ def _densest(group, distance, turn):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _gather(group, mean, distance, turn, inside):  # type: ignore[no-untyped-def]
+def _gather(group, mean, size, inside):  # type: ignore[no-untyped-def]
     """Mark what belongs to a centre, less what is far off for how close most of it is."""
     apart = np.empty(len(group))
     near = 0
     for i in range(len(group)):
-        off = _apart(group[i], mean, distance, turn)
+        off = _apart(group[i], mean, size)
         inside[i] = off <= 1.0
         if inside[i]:
             apart[near] = off
@@ -468,7 +528,7 @@ def _gather(group, mean, distance, turn, inside):  # type: ignore[no-untyped-def
     # Three times the median distance; squared, with some slack for rounding.
     limit = 9.0 * np.median(apart[:near]) + _ROUNDING
     for i in range(len(group)):
-        inside[i] = _apart(group[i], mean, distance, turn) <= min(limit, 1.0)
+        inside[i] = _apart(group[i], mean, size) <= min(limit, 1.0)
 
 
 @kernel
@@ -503,20 +563,23 @@ def _spread(group, inside, mean, scatter):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _distinct(poses, support, groups, distance, turn):  # type: ignore[no-untyped-def]
+def _distinct(poses, support, candidates, size):  # type: ignore[no-untyped-def]
     """Alignments that differ, candidate after candidate, the best supported of equals."""
     chosen = np.empty(len(poses), np.int64)
     found = 0
-    for c in range(len(poses) // groups):
-        begin = found
-        order = np.argsort(-support[c * groups : (c + 1) * groups], kind="mergesort")
+    end = 0
+    while end < len(poses):
+        begin, first = end, found
+        while end < len(poses) and candidates[end] == candidates[begin]:
+            end += 1
+        order = np.argsort(-support[begin:end], kind="mergesort")
         for k in order:
-            g = c * groups + k
-            new = support[g] > 0
-            for other in chosen[begin:found]:
-                if _apart(poses[g], poses[other], distance, turn) <= 1.0:
+            n = begin + k
+            new = support[n] > 0
+            for other in chosen[first:found]:
+                if _apart(poses[n], poses[other], size) <= 1.0:
                     new = False
             if new:
-                chosen[found] = g
+                chosen[found] = n
                 found += 1
     return chosen[:found].copy()

@@ -52,7 +52,7 @@ _MAP: Mapping[str, Any] = {
 }
 
 # The paper's method with its five candidates.  The figures that it does not name were chosen on
-# freiburg-079, csail and Killian Court; intel, freiburg-101 and wean had no part in it.
+# freiburg-079, csail and Killian Court; intel, freiburg-101 and wean had no part in that.
 _PAPER: Mapping[str, Any] = {
     "method": "references",
     "anchors": {"smallest_wall": 0.5, "smallest_turn": math.radians(30.0)},
