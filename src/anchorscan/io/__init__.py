@@ -64,7 +64,8 @@ def open_log(
             not say; those of the base need ``T_base_laser``, from /tf or given.
         odometry_topic: Topic of odometry, or "/tf", of a ROS recording; guessed when there is
             one.
-        T_base_laser: Where the laser sits on the robot, instead of what the recording says.
+        T_base_laser: Where the laser sits on the robot, instead of what a ROS recording or a
+            CARMEN log says; for ``poses`` of the base, of any log.
         is_upside_down: Whether the laser of a ROS recording hangs with its z axis down,
             instead of what /tf says.
         base_frame_id: Name of the robot's base in /tf; else that of the odometry, or the usual

@@ -85,6 +85,8 @@ class LineLog(Log):
             held += ["odometry"] if survey.has_odometry and self._has_corrected_poses else []
             held += ["times"] if survey.has_stamps else []
             yield f"{survey.count} {name} lines with {', '.join(held) or 'scans alone'}"
+            if survey.has_poses and survey.is_one_trajectory and self._has_corrected_poses:
+                yield f"both pose columns of {name} are one trajectory, taken to be corrected"
 
     def _read(self, report: Report) -> Iterator[Record]:
         for index, line in enumerate(self._scan_lines(report)):
