@@ -28,17 +28,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from ..errors import LogError, ScanError
 from ..pose import Pose2D
 from ..record import Record
 from ..scan import LaserScan
 from .frames import Chain, FrameTree, frame_name
-from .geometry import spread
 from .log import Log, Report
 from .posed_log import Body
 from .recording import ODOMETRY_TYPE, POSE_TYPES, SCAN_TYPES, Recording, stamp_of
+from .scan_message import scan_from_message
 from .spatial import from_pose, planar, tilt
 
 __all__ = ["BagLog", "BagOptions", "find_bag"]
@@ -237,19 +237,13 @@ class BagLog(Log):
             return None, message
         options = self._options
         try:
-            ranges = np.asarray(_first_echoes(message.ranges), dtype=np.float32)
-            if not len(ranges):
-                return None, "the scan has no readings"
-            start, increment = message.angle_min, message.angle_increment
-            if options.field_of_view is not None:
-                start, increment = spread(options.field_of_view, len(ranges))
-            if self._is_flipped:
-                start, increment = -start, -increment
-            limit = message.range_max if options.range_max is None else options.range_max
-            # Drivers older than REP-117 publish the limit itself for "no return".
-            ranges = np.where(ranges >= np.float32(limit), np.float32(np.inf), ranges)
-            return LaserScan(ranges, start, increment, message.range_min, limit), ""
-        except (ScanError, ValueError) as error:
+            return scan_from_message(
+                message,
+                field_of_view=options.field_of_view,
+                range_max=options.range_max,
+                is_upside_down=self._is_flipped,
+            ), ""
+        except ScanError as error:
             return None, str(error)
 
 
@@ -389,11 +383,3 @@ class _Setup:
 
 def _absolute(topic: str) -> str:
     return topic if topic.startswith("/") else f"/{topic}"
-
-
-def _first_echoes(ranges: Any) -> ArrayLike:
-    """Return the readings, of a reading with several echoes the first."""
-    if len(ranges) and hasattr(ranges[0], "echoes"):
-        return [one.echoes[0] if len(one.echoes) else math.nan for one in ranges]
-    readings: ArrayLike = ranges
-    return readings
