@@ -238,6 +238,18 @@ def test_covariances_are_symmetric_and_positive():
             assert np.linalg.eigvalsh(hypothesis.covariance)[0] > 0.0
 
 
+def test_covariances_turn_with_the_reference():
+    _, _, scans = building(5)
+    here = Matcher([Reference(0, scans[0], Pose2D(1.0, 2.0, 0.0))], PAPER).locate(scans[1])
+    turn = 0.7
+    there = Matcher([Reference(0, scans[0], Pose2D(-3.0, 0.0, turn))], PAPER).locate(scans[1])
+    rotation = np.eye(3)
+    rotation[:2, :2] = [[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]]
+    for a, b in zip(here, there, strict=True):
+        expected = rotation @ a.covariance @ rotation.T
+        np.testing.assert_allclose(b.covariance, expected, atol=1e-12)
+
+
 def test_identifiers_are_taken_once():
     _, places, scans = building(5, 2)
     matcher = Matcher(references_of(places, scans), PAPER)

@@ -12,12 +12,14 @@ candidate references were; that may be right, and e_m says whether it is.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ._jit import kernel
 from .alignment import Alignment, align
 from .database import RelationshipDatabase, Votes
 from .description import Description
@@ -28,7 +30,7 @@ from .pose import Pose2D
 from .reference import Reference
 from .settings import Settings
 
-__all__ = ["Found", "Known", "Pairwise", "PairwiseSearch", "stand_for"]
+__all__ = ["Found", "Known", "Pairwise", "PairwiseSearch"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,18 +156,6 @@ class Pairwise:
         return there, votes
 
 
-def stand_for(
-    reference: Reference, T_reference_scan: Pose2D, covariance: NDArray[np.float64]
-) -> tuple[Pose2D | None, NDArray[np.float64]]:
-    """Give the pose in the set's frame and turn the covariance into it, where there is one."""
-    if reference.pose is None:
-        return None, covariance
-    c, s = np.cos(reference.pose.theta), np.sin(reference.pose.theta)
-    turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-    covariance = turn @ covariance @ turn.T
-    return reference.pose @ T_reference_scan, 0.5 * (covariance + covariance.T)
-
-
 def _found(alignment: Alignment, candidates: int) -> Found:
     """Return the poses to evaluate: the alignments, or else the places of the candidates."""
     if len(alignment):
@@ -190,29 +180,52 @@ def _hypotheses(
     """Order the evaluated alignments and say what each is worth."""
     order = np.lexsort((found.candidates, -found.support, -e_m))[: settings.acceptance.hypotheses]
     worth = probability(e_m, settings.acceptance)
-    deviations = (
-        settings.alignment.position_deviation,
+    covariances = _covariances(
+        found.scatter[order],
+        np.array([_heading(references[c]) for c in found.candidates[order].tolist()]),
         settings.alignment.position_deviation,
         settings.alignment.heading_deviation,
     )
-    least = np.diag(np.square(deviations))
     hypotheses = []
-    for n in order.tolist():
+    for n, covariance in zip(order.tolist(), covariances, strict=True):
         candidate = int(found.candidates[n])
         reference = references[candidate]
         T_reference_scan = Pose2D(*found.poses[n].tolist())
-        pose, covariance = stand_for(reference, T_reference_scan, found.scatter[n] + least)
+        fit = float(e_m[n])
         hypotheses.append(
             Hypothesis(
                 reference=reference.identifier,
                 pose_in_reference=T_reference_scan,
-                pose=pose,
+                pose=None if reference.pose is None else reference.pose @ T_reference_scan,
                 covariance=covariance,
-                evaluation=float(e_m[n]),
+                evaluation=fit,
                 quality=float(votes.quality[candidate]),
-                score=float(e_m[n]),
+                score=fit,
                 probability=float(worth[n]),
-                accepted=bool(e_m[n] >= settings.acceptance.threshold),
+                accepted=fit >= settings.acceptance.threshold,
             )
         )
     return tuple(hypotheses)
+
+
+def _heading(reference: Reference) -> float:
+    return 0.0 if reference.pose is None else reference.pose.theta
+
+
+@kernel
+def _covariances(scatter, headings, position, heading):  # type: ignore[no-untyped-def]
+    """Scatter with the least deviations added, turned into the frame of the set."""
+    covariances = np.empty((len(scatter), 3, 3))
+    for n in range(len(scatter)):
+        c, s = math.cos(headings[n]), math.sin(headings[n])
+        xx = scatter[n, 0, 0] + position * position
+        yy = scatter[n, 1, 1] + position * position
+        xy, xt, yt = scatter[n, 0, 1], scatter[n, 0, 2], scatter[n, 1, 2]
+        out = covariances[n]
+        out[0, 0] = c * c * xx - 2.0 * c * s * xy + s * s * yy
+        out[1, 1] = s * s * xx + 2.0 * c * s * xy + c * c * yy
+        out[0, 1] = out[1, 0] = c * s * (xx - yy) + (c * c - s * s) * xy
+        out[0, 2] = out[2, 0] = c * xt - s * yt
+        out[1, 2] = out[2, 1] = s * xt + c * yt
+        out[2, 2] = scatter[n, 2, 2] + heading * heading
+    return covariances
