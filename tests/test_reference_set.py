@@ -151,7 +151,7 @@ class SetAgainstDict(RuleBasedStateMachine):
 
 
 SetAgainstDict.TestCase.settings = settings(
-    max_examples=25, stateful_step_count=12, deadline=None, suppress_health_check=list(HealthCheck)
+    max_examples=15, stateful_step_count=12, deadline=None, suppress_health_check=list(HealthCheck)
 )
 TestSetAgainstDict = SetAgainstDict.TestCase
 
@@ -324,11 +324,13 @@ class TestBuild:
         records[2] = replace(records[2], scan=None)
         records[3] = replace(records[3], scan=blind)
         records.append(replace(records[0], pose=Pose2D(math.nan, 0, 0)))
+        endless = LaserScan(np.ones(MOST_READINGS + 1), 0, 1e-6)
+        records.append(replace(records[0], scan=endless))
         places = ReferenceSet.build(records, keep_all=True)
         assert kept(places) == [0, 4]
         build = places.info().build
         assert build is not None
-        assert (build.consumed, build.unusable, build.without_pose) == (6, 2, 2)
+        assert (build.consumed, build.unusable, build.without_pose) == (7, 3, 2)
         assert kept(ReferenceSet.build(records)) == [0]
 
     @pytest.mark.parametrize(

@@ -195,11 +195,14 @@ class TestSharing:
     def test_readers_go_on_while_one_appends(self, tmp_path: Path) -> None:
         path = tmp_path / "a.apr"
         ReferenceSet(path=path).close()
-        ended = threading.Event()
+        ended, read = threading.Event(), threading.Event()
 
         def append() -> None:
             with ReferenceSet.open(path) as places:
                 for first in range(0, 40 * BATCH, BATCH):
+                    if first % (10 * BATCH) == 0:  # however busy the machine is
+                        read.clear()
+                        read.wait(10.0)
                     numbers = range(first, first + BATCH)
                     places.add_batch([scan_of(n) for n in numbers], [pose_of(n) for n in numbers])
             ended.set()
@@ -212,6 +215,7 @@ class TestSharing:
             check_bits(places)
             assert len(places) % BATCH == 0
             counts.append(len(places))
+            read.set()
         writer.join()
         assert counts == sorted(counts)
         assert len(set(counts)) > 2

@@ -37,6 +37,7 @@ from .scan import LaserScan
 from .set_directory import read_directory, write_directory
 from .set_file import (
     FORMAT,
+    MOST_READINGS,
     BuildState,
     Place,
     Sensor,
@@ -667,7 +668,7 @@ def _choose(
     for record in batch:
         trail = _follow(trail, record)
         scan, pose = record.scan, record.pose
-        if scan is None or not scan.is_return.any():
+        if scan is None or len(scan) > MOST_READINGS or not scan.is_return.any():
             unusable += 1
         elif pose is None or not pose.is_finite():
             without_pose += 1

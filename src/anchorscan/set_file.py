@@ -185,7 +185,7 @@ class BuildState:
         heading: Of the rule, radians.
         keep_all: Whether every usable scan with a pose was kept, whatever the rule says.
         consumed: Records read so far.
-        unusable: Those of them without a scan, or without a single return in it.
+        unusable: Those of them without a scan that can be stored and has a return.
         without_pose: Those of them with a usable scan but no finite pose.
         trail: 16 bytes that stand for the records read so far, in their order.
         finished: Whether the last record was reached.
