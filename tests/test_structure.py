@@ -24,6 +24,7 @@ ORDER = (
     *("field", "proposal", "verification", "evaluation", "hypothesis", "decision", "settings"),
     *("description", "pairwise", "stitched_map", "matcher"),
     *("set_file", "set_directory", "reference_set", "localizer"),
+    *("explanation", "drawing"),
     *("sensor", "occupancy", "map_file", "world", "building", "simulator", "exhaustive_search"),
     *("karto_matcher", "stage_times", "scoreboard"),
 )

@@ -59,6 +59,22 @@ class Body(str, Enum):
     laser = "laser"
 
 
+class PictureTheme(str, Enum):
+    """Background of pictures."""
+
+    light = "light"
+    dark = "dark"
+    both = "both"
+
+
+class PictureFormat(str, Enum):
+    """Kind of picture files."""
+
+    png = "png"
+    svg = "svg"
+    pdf = "pdf"
+
+
 app = typer.Typer(
     name="anchorscan",
     help="Where a robot is, from one 2D laser scan and no prior guess.",
@@ -152,6 +168,14 @@ def _parse_preset(text: str) -> str:
     return text
 
 
+CandidatesOption = Annotated[
+    Any,
+    typer.Option(
+        parser=_parse_candidates,
+        metavar="K|all",
+        help="How many references to align with, instead of what the settings say.",
+    ),
+]
 SetArgument = Annotated[Path, typer.Argument(metavar="SET", help="A reference set.")]
 LogArgument = Annotated[Path, typer.Argument(metavar="LOG", help="A log of laser scans.")]
 FieldOfViewOption = Annotated[
@@ -262,14 +286,7 @@ def build(
 def locate(
     set_file: SetArgument,
     log: LogArgument,
-    candidates: Annotated[
-        Any,
-        typer.Option(
-            parser=_parse_candidates,
-            metavar="K|all",
-            help="How many references to align with, instead of what the settings say.",
-        ),
-    ] = None,
+    candidates: CandidatesOption = None,
     output: Annotated[
         Path | None,
         typer.Option("--output", "-o", metavar="OUT", help="File for the JSON lines, not stdout."),
@@ -304,6 +321,53 @@ def locate(
         f"{log}: {count} scans: {accepted} located, {count - accepted - unusable} not known, "
         f"{unusable} unusable"
     )
+
+
+@app.command()
+@_guarded
+def explain(
+    set_file: SetArgument,
+    log: LogArgument,
+    scan: Annotated[
+        int, typer.Option("--scan", min=0, metavar="N", help="Which scan of the log, from zero.")
+    ],
+    output: Annotated[
+        Path, typer.Option("--output", "-o", metavar="DIR", help="Folder for the pictures.")
+    ],
+    theme: Annotated[
+        PictureTheme, typer.Option(help="Background of the pictures.")
+    ] = PictureTheme.light,
+    file_format: Annotated[
+        PictureFormat, typer.Option("--format", help="Kind of the pictures.")
+    ] = PictureFormat.png,
+    candidates: CandidatesOption = None,
+    field_of_view: FieldOfViewOption = None,
+    range_max: RangeMaxOption = None,
+    topic: TopicOption = None,
+    upside_down: UpsideDownOption = False,
+    preset: PresetOption = None,
+    settings_file: SettingsOption = None,
+) -> None:
+    """Draw why a scan was located where it was: a picture for every step of the algorithm.
+
+    Prints the names of the files.
+    """
+    from .drawing import require_matplotlib
+    from .explanation import Explanation
+    from .figures import THEMES, save_all
+    from .reference_set import ReferenceSet
+
+    require_matplotlib()
+    opened = _open_log(log, _reading(field_of_view, range_max, topic, upside_down))
+    record = _record(opened, scan)
+    with ReferenceSet.open(set_file, settings=_read_settings(preset, settings_file)) as places:
+        assert record.scan is not None
+        trace = places.explain(record.scan, candidates)
+        explanation = Explanation(trace, places.references, record.pose)
+    themes = [each for name, each in THEMES.items() if theme.value in (name, "both")]
+    for path in save_all(explanation, output, themes, file_format.value):
+        typer.echo(str(path))
+    _say(f"{log}: scan {scan}: {_verdict(trace.hypotheses[0])}")
 
 
 @app.command()
@@ -474,6 +538,18 @@ def _map_records(
     return _progress(reference_scans(grid, sensor, spacing=spacing, heading=heading), "simulating")
 
 
+def _record(log: Log, index: int) -> Record:
+    """Return one record of a log that has a usable scan."""
+    count = 0
+    for record in _records(log):
+        if record.index == index:
+            if record.scan is None:
+                raise LogError(f"scan {index} cannot be used: {record.problem}", log.path)
+            return record
+        count += 1
+    raise LogError(f"has {count} scans, from 0 on: no scan {index}", log.path)
+
+
 def _total(*logs: Log) -> int | None:
     total = 0
     for log in logs:
@@ -568,6 +644,16 @@ def _pose_line(pose: Pose2D | None) -> dict[str, float | None]:
     if pose is None:  # the set has no common frame
         return {"x": None, "y": None, "theta": None}
     return {name: round(getattr(pose, name), _DECIMALS) for name in ("x", "y", "theta")}
+
+
+def _verdict(best: Hypothesis) -> str:
+    """Say in words what a best hypothesis amounts to."""
+    verdict = "located" if best.accepted else "not known; the best guess is"
+    pose, frame = best.pose, "x {0.x:.2f} m, y {0.y:.2f} m, {1:.0f} degrees"
+    if pose is None:
+        pose, frame = best.pose_in_reference, f"reference {best.reference}, {frame}"
+    where = frame.format(pose, math.degrees(pose.theta))
+    return f"{verdict} at {where} (probability {best.probability:.3f})"
 
 
 def _significant(value: float) -> float:
