@@ -308,7 +308,9 @@ def locate(
     """
     opened = _open_log(log, _reading(field_of_view, range_max, topic, upside_down))
     settings = _read_settings(preset, settings_file)
-    records = _progress(_records(opened), "locating", opened.count)
+    records: Iterable[Record] = _records(opened)
+    if output is not None or not sys.stdout.isatty():  # a bar and lines would run into each other
+        records = _progress(records, "locating", opened.count)
     accepted = unusable = count = 0
     with _writing(output) as stream:
         for line in _located(records, set_file, settings, candidates, processes):
