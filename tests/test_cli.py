@@ -256,7 +256,7 @@ def test_settings_come_from_a_preset_or_a_file(
 def test_version_and_help(run: Run) -> None:
     assert run("--version").out == f"anchorscan {__version__}\n"
     text = run("--help").out
-    for name in ("build", "locate", "info", "demo"):
+    for name in ("build", "locate", "explain", "info", "bench", "check-map", "demo"):
         assert f"\n  {name} " in text
         assert run(name, "--help").code == 0
 
