@@ -171,7 +171,7 @@ def jump_edge_anchors(
     angles: AngleFunction, surfaces: Segments, settings: AnchorSettings
 ) -> NDArray[np.float64]:
     """Find the jump edge anchors: (J, 4) rows x, y, direction of free space, kind."""
-    return _jump_edges(
+    rows: NDArray[np.float64] = _jump_edges(
         angles.points,
         angles.gaps,
         angles.way,
@@ -180,13 +180,14 @@ def jump_edge_anchors(
         surfaces.last,
         (settings.arm, settings.shortest_arm, settings.flatness, settings.smallest_rim_angle),
     )
+    return rows
 
 
 def angle_anchors(
     angles: AngleFunction, surfaces: Segments, settings: AnchorSettings
 ) -> NDArray[np.float64]:
     """Find the angle anchors: (C, 4) rows x, y, direction of free space, kind."""
-    return _angle_anchors(
+    rows: NDArray[np.float64] = _angle_anchors(
         angles.points,
         angles.way,
         angles.moments,
@@ -200,6 +201,7 @@ def angle_anchors(
             settings.farthest_corner,
         ),
     )
+    return rows
 
 
 def virtual_edges(angles: AngleFunction, settings: AnchorSettings) -> list[VirtualEdges]:

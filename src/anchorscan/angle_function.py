@@ -121,7 +121,8 @@ def angle_histogram(angles: AngleFunction, settings: AngleFunctionSettings) -> N
     Every reading weighs as the length of surface that it stands for, not as one: so a
     wall counts by its size and not by its closeness to the sensor.
     """
-    return _histogram(angles.surface, angles.extents, settings.bins)
+    histogram: NDArray[np.float64] = _histogram(angles.surface, angles.extents, settings.bins)
+    return histogram
 
 
 def main_angle(histogram: NDArray[np.float64]) -> float:

@@ -76,7 +76,8 @@ class Pose2D:
         """Carry ``(N, 2)`` points (metres) from the source frame into the target frame."""
         array = np.asarray(points, dtype=np.float64)
         c, s = math.cos(self.theta), math.sin(self.theta)
-        return array @ np.array([[c, s], [-s, c]]) + (self.x, self.y)
+        moved: NDArray[np.float64] = array @ np.array([[c, s], [-s, c]]) + (self.x, self.y)
+        return moved
 
     def distance(self, other: Pose2D) -> float:
         """Return the distance between the two positions, metres."""

@@ -100,7 +100,8 @@ class LaserScan:
     @cached_property
     def angles(self) -> NDArray[np.float64]:
         """(N,) direction of every reading, radians, scan frame."""
-        return self.angle_min + self.angle_increment * np.arange(len(self.ranges))
+        readings = np.arange(len(self.ranges), dtype=np.float64)
+        return self.angle_min + self.angle_increment * readings
 
     @cached_property
     def is_return(self) -> NDArray[np.bool_]:

@@ -102,7 +102,6 @@ def verify(
         settings.distinct_turn,
     )
     chosen = _sieve(poses, points, tiles, weights, sieves)
-    steps = (settings.fit_readings, settings.iterations)
     places = (settings.place_distance, settings.place_turn)
     rays = (settings.rays, settings.through_margin, settings.followed)
     steps = (settings.fit_readings, settings.iterations, settings.last_readings)
