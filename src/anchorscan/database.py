@@ -107,14 +107,22 @@ class _Part:
         np.cumsum(np.bincount(_bins(lengths), minlength=_BINS), out=starts[1:])
         return cls(lengths[order], slots[order], starts)
 
-    def with_edges(self, lengths: NDArray[np.float32], slot: int) -> _Part:
-        """Merge the ordered edges of one more reference."""
-        at = np.searchsorted(self.lengths, lengths)
-        starts = self.starts.copy()
-        starts[1:] += np.cumsum(np.bincount(_bins(lengths), minlength=_BINS))
+    def merged(self, other: _Part) -> _Part:
+        """Merge a smaller part into this one."""
+        at = np.searchsorted(self.lengths, other.lengths, side="right")
         return _Part(
-            np.insert(self.lengths, at, lengths), np.insert(self.slots, at, np.int32(slot)), starts
+            np.insert(self.lengths, at, other.lengths),
+            np.insert(self.slots, at, other.slots),
+            self.starts + other.starts,
         )
+
+    def renumbered(self, alive: NDArray[np.bool_]) -> _Part:
+        """Leave out the edges of dead slots and count the living from zero."""
+        kept = alive[self.slots]
+        before = np.zeros(len(kept) + 1, np.int64)
+        np.cumsum(kept, out=before[1:])
+        numbers = np.cumsum(alive, dtype=np.int32) - np.int32(1)
+        return _Part(self.lengths[kept], numbers[self.slots[kept]], before[self.starts])
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,11 +192,13 @@ class RelationshipDatabase:
             sizes = _with_room(state.sizes, slot)
             identifiers[slot] = identifier
             sizes[slot] = len(graph)
-            recent = state.recent.with_edges(graph.lengths.astype(np.float32), slot)
+            lengths = graph.lengths.astype(np.float32)
+            edges = _Part.of(lengths, np.full(len(lengths), slot, np.int32))
+            recent = state.recent.merged(edges)
             self._slots[identifier] = slot
             self._state = _State(state.main, recent, identifiers, sizes, slot + 1)
-            edges = len(state.main.lengths)
-            if len(recent.lengths) > max(_SMALLEST_RECENT, math.isqrt(_RECENT_SHARE * edges)):
+            share = math.isqrt(_RECENT_SHARE * len(state.main.lengths))
+            if len(recent.lengths) > max(_SMALLEST_RECENT, share):
                 self._merge()
 
     def remove(self, identifier: int) -> None:
@@ -245,21 +255,16 @@ class RelationshipDatabase:
     def _merge(self) -> None:
         """Put both parts into a new main part and forget what was removed."""
         state = self._state
-        alive = state.sizes[: state.used] >= 0
-        renumbered = np.cumsum(alive, dtype=np.int32) - np.int32(1)
-        lengths = np.concatenate([state.main.lengths, state.recent.lengths])
-        slots = np.concatenate([state.main.slots, state.recent.slots])
-        kept = alive[slots]
-        identifiers = state.identifiers[: state.used][alive]
-        self._slots = {int(identifier): slot for slot, identifier in enumerate(identifiers)}
-        self._removed = 0
-        self._state = _State(
-            _Part.of(lengths[kept], renumbered[slots[kept]]),
-            _EMPTY,
-            identifiers,
-            state.sizes[: state.used][alive],
-            len(identifiers),
-        )
+        main, recent, used = state.main, state.recent, state.used
+        identifiers, sizes = state.identifiers, state.sizes
+        if self._removed:
+            alive = sizes[:used] >= 0
+            main, recent = main.renumbered(alive), recent.renumbered(alive)
+            identifiers, sizes = identifiers[:used][alive], sizes[:used][alive]
+            used = len(identifiers)
+            self._slots = {identifier: slot for slot, identifier in enumerate(identifiers.tolist())}
+            self._removed = 0
+        self._state = _State(main.merged(recent), _EMPTY, identifiers, sizes, used)
 
 
 def quality(graph: AnchorGraph, other: AnchorGraph, settings: DatabaseSettings) -> float:
