@@ -129,7 +129,7 @@ def test_e_m_is_the_share_of_the_front_scan_that_agrees(seed):
 # --- Properties ------------------------------------------------------------------------
 
 
-@settings(deadline=None)
+@settings(deadline=None, max_examples=40)
 @given(st.integers(0, 10_000))
 def test_a_scan_agrees_with_itself_fully(seed):
     _, (scan,) = scans(seed, 1)
@@ -142,7 +142,7 @@ def test_a_real_scan_agrees_with_itself_fully(real_records):
             assert evaluate(record.scan, record.scan, Pose2D()).e_m == 1.0
 
 
-@settings(deadline=None)
+@settings(deadline=None, max_examples=40)
 @given(st.integers(0, 10_000), st.floats(-math.pi, math.pi))
 def test_a_full_turn_agrees_with_its_turned_copy(seed, turn):
     full = SensorModel(field_of_view=2.0 * math.pi, resolution=math.radians(1.0), noise=0.0)
@@ -153,7 +153,7 @@ def test_a_full_turn_agrees_with_its_turned_copy(seed, turn):
     assert evaluate(turned, scan, Pose2D(0.0, 0.0, -turn)).e_m > 0.99
 
 
-@settings(deadline=None)
+@settings(deadline=None, max_examples=40)
 @given(st.integers(0, 10_000))
 def test_the_sense_of_rotation_does_not_matter(seed):
     (a, b), (scan, reference) = scans(seed, 2, SENSORS[:1])
