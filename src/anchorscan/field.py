@@ -41,6 +41,8 @@ _SIDE = 64  # cells of a tile
 _COARSE = 4  # cells of a coarse cell
 _FAR = 63  # distance code of "farther than reach"
 _FREE, _SURFACE = 64, 128
+# Farther than this from all surfaces, metres, a ray is clear of them.
+_CLEAR = 0.2
 # Hit positions are summed in 256ths of a cell, so that sums stay integers.
 _FRACTIONS = 256
 _4, _6, _8, _12, _15, _63 = (np.uint64(value) for value in (4, 6, 8, 12, 15, 63))
@@ -57,15 +59,20 @@ class FieldSettings(BaseModel):
     margin: float = Field(0.15, ge=0.0, description="end of a ray that frees nothing, metres")
     fewest_passes: int = Field(2, ge=1, description="rays that make free space known")
     passes_per_hit: float = Field(2.0, gt=0.0, description="more passes, and it is no surface")
-    sharpness: float = Field(0.4, gt=0.0, description="distance that scores nothing, metres")
-    free_penalty: float = Field(0.5, ge=0.0, description="score lost in known free space")
+    sharpness: float = Field(0.25, gt=0.0, description="distance that scores nothing, metres")
+    unknown_score: float = Field(
+        0.05, ge=0.0, le=1.0, description="score of a reading that ends where nobody looked"
+    )
+    free_penalty: float = Field(0.7, ge=0.0, description="score lost in known free space")
 
     def weights(self) -> NDArray[np.float32]:
         """(256,) score of a reading by the byte of the cell in which it ends."""
         code = np.arange(256)
         distance = (code & _FAR) * self.reach / _FAR
-        score = np.maximum(0.0, 1.0 - distance / self.sharpness)
-        score[((code & _FAR) == _FAR) & ((code & _FREE) > 0)] = -self.free_penalty
+        score = np.maximum(self.unknown_score, 1.0 - distance / self.sharpness)
+        near, far = 0.5 * self.sharpness, 0.75 * self.sharpness
+        fall = np.interp(distance, (near, far), (0.5, -self.free_penalty))
+        score = np.where(((code & _FREE) > 0) & (distance > near), fall, score)
         return score.astype(np.float32)
 
 
@@ -471,19 +478,29 @@ def refined(pose, points, tiles, iterations):  # type: ignore[no-untyped-def]
 
 @kernel
 def passed_through(pose, points, tiles, margin):  # type: ignore[no-untyped-def]
-    """Share of rays that pass through a known surface more than ``margin`` before their end."""
+    """Share of rays that pass through a known surface more than ``margin`` before their end.
+
+    A ray passes through when it is clear of all surfaces shortly before and shortly after it
+    meets one: a ray that grazes a wall touches its cells without passing through.
+    """
     c, s = math.cos(pose[2]), math.sin(pose[2])
     x = pose[0] / tiles.resolution - tiles.column
     y = pose[1] / tiles.resolution - tiles.row
+    clear = int(_CLEAR / tiles.reach * _FAR)
+    shortly = int(2.0 * _CLEAR / tiles.resolution)
     through = 0
     for i in range(len(points)):
         length = math.hypot(points[i, 0], points[i, 1])
         dx = (c * points[i, 0] - s * points[i, 1]) / length
         dy = (s * points[i, 0] + c * points[i, 1]) / length
-        for k in range(4, int((length - margin) / tiles.resolution)):
-            cx = int(x + k * dx)
-            cy = int(y + k * dy)
-            if cell_code(tiles, cx, cy) & _SURFACE:
-                through += 1
-                break
+        last_clear, met = -shortly, -1
+        for k in range(int((length - margin) / tiles.resolution)):
+            code = cell_code(tiles, int(x + k * dx), int(y + k * dy))
+            if (code & _FAR) >= clear:
+                if met >= 0 and k - met <= shortly:
+                    through += 1
+                    break
+                last_clear, met = k, -1
+            elif code & _SURFACE and met < 0 and k - last_clear <= shortly:
+                met = k
     return through / max(len(points), 1)
