@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import itertools
 import os
 from collections.abc import Callable
 from pathlib import Path
@@ -10,7 +11,7 @@ from pathlib import Path
 import hypothesis
 import pytest
 
-from anchorscan import Record
+from anchorscan import LaserScan, Record
 
 # No test measures time, and the first example of one may wait for a kernel to be compiled.
 hypothesis.settings.register_profile(
@@ -48,3 +49,32 @@ def real_records(data_file: Callable[[str], Path]) -> Callable[[str], list[Recor
         return list(open_log(data_file(name)))
 
     return read
+
+
+# A few scans of each log: a sensor of 180 degrees or more, and the turntable of a small robot.
+_SAMPLED = ("freiburg-101.log.gz", "csail.log.gz", "olin", "killian")
+_SAMPLES = 6
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Name the marks that tests carry."""
+    config.addinivalue_line(
+        "markers", "interpreted: also run without compilation, by tests/test_interpreted.py"
+    )
+
+
+@pytest.fixture(scope="session", params=_SAMPLED)
+def real_scans(
+    request: pytest.FixtureRequest, real_records: Callable[[str], list[Record]]
+) -> list[LaserScan]:
+    """Give a few scans of a real log, spread over its first part; or skip the test."""
+    from anchorscan import open_log
+
+    if request.param == "killian":
+        home = pytest.importorskip("rtbdata", reason="Killian Court comes with rtb-data")
+        log = open_log(Path(home.__file__).parent / "data" / "killian.g2o.zip")
+        records = list(itertools.islice(log, 40 * _SAMPLES))
+    else:
+        records = real_records(request.param)
+    scans = [record.scan for record in records if record.scan is not None]
+    return scans[:: -(-len(scans) // _SAMPLES)]

@@ -3,8 +3,8 @@
 The angle function gives the direction of the surface at every reading.  Hinkel and
 Knieriemen take two readings a constant angle apart; the paper chooses the offset per
 reading so that the two points lie at similar *metric* distance, and so do we: the pair
-of reading *i* is the first and the last reading within half a ``baseline`` of way along
-the surface on either side, and never reaches across a gap.
+of reading *i* is the nearest reading on either side that lies half a ``baseline`` of way
+along the surface away, or else the end of the surface; it never reaches across a gap.
 
 Departures from the paper: readings are taken in counter-clockwise order and the angle
 is kept modulo 360 degrees, as the direction in which the surface is *walked* with the
@@ -90,6 +90,7 @@ def angle_function(scan: LaserScan, settings: AngleFunctionSettings) -> AngleFun
     A scan of either sense of rotation and any field of view will do; the ends of a full
     turn are neighbours, and a second look at the same direction is dropped.
     """
+    step = abs(scan.angle_increment)
     points, ranges, beams, indices, count = _returns(
         scan.ranges, scan.angle_min, scan.angle_increment, scan.range_min, scan.range_max
     )
@@ -99,8 +100,8 @@ def angle_function(scan: LaserScan, settings: AngleFunctionSettings) -> AngleFun
         beams,
         indices,
         _free_before(scan.ranges, scan.range_max, scan.angle_increment, count),
-        count if scan.is_full_turn else 0,
-        abs(scan.angle_increment),
+        max(count, round(2.0 * math.pi / step)) if scan.is_full_turn else 0,
+        step,
         (
             settings.grazing_angle,
             settings.noise,
@@ -190,7 +191,10 @@ def _gap(near, far, cosine, spread, limits):  # type: ignore[no-untyped-def]
 
 @kernel
 def _gaps(points, ranges, beams, indices, free, turn, step, limits):  # type: ignore[no-untyped-def]
-    """What lies between each return and the next; ``turn`` is the sweep's length if closed."""
+    """What lies between each return and the next.
+
+    ``turn`` is the number of readings in a full turn where the sweep is closed, or else 0.
+    """
     count = len(ranges)
     gaps = np.full(count, UNKNOWN, np.int64)
     most_missing = 3

@@ -19,8 +19,11 @@ from .errors import ScanError
 
 __all__ = ["LaserScan"]
 
-# A reading that misses the full turn by less than this share of an increment still closes it.
-_CLOSING_SLACK = 0.5
+# So many readings may be missing to a full turn: some sensors leave out the one that would
+# complete it, and rounding of the increment takes a little more.
+_CLOSING_SLACK = 1.5
+# A smaller angle between readings, radians, is no angle but an error in the message.
+_SMALLEST_INCREMENT = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,6 +64,8 @@ class LaserScan:
                 raise ScanError(f"{name} must be finite, not {getattr(self, name)}")
         if self.angle_increment == 0.0 and len(ranges) > 1:
             raise ScanError("angle_increment must not be zero")
+        if 0.0 < abs(self.angle_increment) < _SMALLEST_INCREMENT:
+            raise ScanError(f"angle_increment is too small: {self.angle_increment}")
         if abs(self.angle_increment) * len(ranges) > 4.0 * math.pi:
             raise ScanError("the readings span more than two turns; is angle_increment in degrees?")
         if not 0.0 <= self.range_min < self.range_max:

@@ -1,0 +1,59 @@
+"""The laser scan: what is a reading, and when a sweep closes."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scans import sweeps
+
+from anchorscan import LaserScan, ScanError
+
+
+@given(sweeps())
+def test_a_reading_is_a_return_free_or_no_information(scan):
+    expected = [
+        "return"
+        if scan.range_min <= r <= scan.range_max and 0.0 < r < math.inf
+        else "free"
+        if r > scan.range_max
+        else ""
+        for r in scan.ranges.tolist()
+    ]
+    assert np.where(scan.is_return, "return", np.where(scan.is_free, "free", "")).tolist() == (
+        expected
+    )
+    ranges = scan.ranges[scan.is_return].astype(np.float64)
+    np.testing.assert_allclose(np.hypot(*scan.points.T), ranges, rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("count", "degrees", "closes"),
+    [
+        (360, 1.0, True),
+        (361, 1.0, True),
+        (359, 1.0, True),  # the reading that would complete the turn is left out
+        (358, 1.0, False),
+        (270, 1.0, False),
+        (720, 0.4993046, True),  # an RPLidar: 720 readings, 359.5 degrees
+        (1081, 0.25, False),
+        (2, 180.0, False),
+    ],
+)
+@pytest.mark.parametrize("sense", [1.0, -1.0])
+def test_a_full_turn_closes(count, degrees, closes, sense):
+    scan = LaserScan(np.ones(count), 0.3, sense * math.radians(degrees))
+    assert scan.is_full_turn == closes
+
+
+def test_the_turntable_of_a_real_sensor_closes(real_records):
+    assert all(record.scan.is_full_turn for record in real_records("olin"))
+
+
+@given(st.floats(-1e-9, 1e-9, exclude_min=True, exclude_max=True).filter(bool))
+def test_an_increment_that_is_no_angle_is_refused(increment):
+    with pytest.raises(ScanError, match="increment"):
+        LaserScan(np.ones(3), 0.0, increment)
