@@ -33,9 +33,9 @@ def test_the_demo_as_a_user_runs_it(
     counts = [int(word) for word in words[words.index("scan") + 1 :][:4]]
     correct, wrong, silent, best = counts
     assert correct + wrong + silent == 807
-    assert best >= correct
     # The corridors are twins of each other: it must say so rather than err.
-    assert correct >= 80
+    assert 500 < best < 807
+    assert correct > 20
     assert wrong <= 0.02 * (correct + wrong)
     picture = tmp_path / "new" / "killian-court.png"
     assert str(picture) in words
