@@ -2,18 +2,18 @@
 
 The paper thresholds e_m and leaves probabilities to the filter.  Nearly all confident wrong
 answers have a near-equal twin elsewhere: the same shape in another room.  So the probability
-that the best fit is right is a logistic function of four numbers:
+that the best fit is right is a logistic function of three numbers:
 
-    log m       of the margin m of its score to the best fit at another place,
-    m           itself,
-    -log(1 - s) of its score s: how much of the scan the map explains,
-    through     the share of rays that pass through known surfaces.
+    log m           of the margin m of its score to the best fit at another place,
+    -log(1 - s)     of its score s: how much of the scan the map explains,
+    sqrt(through)   of the share of rays that pass through known surfaces.
 
 What is left goes to the other fits and to "somewhere else", in proportion to
 ``exp(rivalry * score)``; "somewhere else" competes with a fixed score.
 
-The coefficients are fitted by ``anchorscan calibrate``; see the calibration page of the
-documentation for the logs, the rotation over buildings, and what it gave.
+The coefficients come from ``anchorscan calibrate``, which fits them on some buildings and
+reports on the others, in turn; what it gave stands on the calibration page of the
+documentation.
 """
 
 from __future__ import annotations
@@ -39,11 +39,12 @@ class DecisionSettings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    constant: float = Field(-0.81, description="of the logistic function")
-    log_margin: float = Field(1.57, description="weight of the logarithm of the margin")
-    margin: float = Field(-8.88, description="weight of the margin")
-    explained: float = Field(3.22, description="weight of -log(1 - score)")
-    through: float = Field(-5.44, description="weight of the share of rays that see through")
+    constant: float = Field(0.59, description="of the logistic function")
+    log_margin: float = Field(1.44, description="weight of the logarithm of the margin")
+    explained: float = Field(2.76, description="weight of -log(1 - score)")
+    through: float = Field(
+        -5.34, description="weight of the root of the share of rays that see through"
+    )
     rivalry: float = Field(30.0, gt=0.0, description="of the fits for what the best leaves")
     elsewhere: float = Field(0.8, description="score with which 'somewhere else' competes")
     threshold: float = Field(0.95, gt=0.0, le=1.0, description="probability that is an answer")
@@ -74,7 +75,7 @@ class Decision:
 
 
 def evidence(fits: Fits) -> NDArray[np.float64]:
-    """Return the (5,) numbers that speak for the best fit: 1 and those of the module's text.
+    """Return the (4,) numbers that speak for the best fit: 1 and those of the module's text.
 
     A fit without a rival has a margin as if the rival scored half as much.
     """
@@ -83,7 +84,7 @@ def evidence(fits: Fits) -> NDArray[np.float64]:
     margin = max(score - rival, _SMALLEST_MARGIN)
     explained = -math.log(1.0 - min(score, _LARGEST_SCORE))
     through = float(fits.features[0, _THROUGH])
-    return np.array([1.0, math.log(margin), margin, explained, through])
+    return np.array([1.0, math.log(margin), explained, math.sqrt(through)])
 
 
 def covariance(fits: Fits, settings: DecisionSettings) -> NDArray[np.float64]:
@@ -128,7 +129,6 @@ def decide(fits: Fits, settings: DecisionSettings) -> Decision:
     weights = (
         settings.constant,
         settings.log_margin,
-        settings.margin,
         settings.explained,
         settings.through,
     )

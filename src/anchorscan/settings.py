@@ -79,11 +79,10 @@ PRESETS: Mapping[str, Mapping[str, Any]] = types.MappingProxyType(
                 "rays": 180,
             },
             "decision": {
-                "constant": -1.88,
-                "log_margin": 1.38,
-                "margin": -9.23,
-                "explained": 3.41,
-                "through": -5.66,
+                "constant": 1.16,
+                "log_margin": 1.54,
+                "explained": 2.71,
+                "through": -5.78,
             },
         },
     }
