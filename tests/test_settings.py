@@ -15,11 +15,11 @@ def test_a_preset_survives_json(name):
     assert Settings.from_json(preset.to_json()) == preset
 
 
-def test_what_is_left_out_has_its_default():
-    assert Settings.from_json("{}") == Settings()
-    assert Settings.from_json('{"database": {"candidates": 9}}') == Settings().changed(
-        {"database": {"candidates": 9}}
-    )
+def test_what_is_left_out_is_as_in_the_default_preset():
+    default = Settings.preset("default")
+    assert Settings.from_json("{}") == default
+    changes = {"database": {"candidates": 9}}
+    assert Settings.from_json('{"database": {"candidates": 9}}') == default.changed(changes)
 
 
 @pytest.mark.parametrize(

@@ -24,6 +24,7 @@ ORDER = (
     *("field", "proposal", "verification", "evaluation", "hypothesis", "decision", "settings"),
     *("description", "pairwise", "stitched_map", "matcher"),
     *("set_file", "set_directory", "reference_set", "localizer"),
+    *("robot", "robot_parameters", "mailbox"),
     *("explanation", "drawing"),
     *("sensor", "occupancy", "map_file", "world", "building", "simulator", "exhaustive_search"),
     *("karto_matcher", "stage_times", "scoreboard"),
@@ -31,7 +32,7 @@ ORDER = (
 VALUES = {"errors", "pose", "scan", "record", "reference"}
 # Imported by nobody, but for the command line, which loads them inside its commands.
 LEAVES = {
-    *("benchmark", "report", "figures", "viewer", "demo", "map_check", "ros_node", "cli"),
+    *("benchmark", "calibration", "report", "figures", "viewer", "demo", "map_check", "ros_node", "cli"),
     "__main__",
 }
 SILENT = {"print", "exit", "quit", "breakpoint", "input"}

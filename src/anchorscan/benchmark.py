@@ -163,6 +163,19 @@ class Task:
             if record.scan is not None
         )
 
+    @property
+    def buildings(self) -> tuple[str, str]:
+        """Buildings of the references and of the queries."""
+        return self.known.building, self.asked.building
+
+    @property
+    def queries(self) -> Iterator[tuple[LaserScan, Pose2D | None]]:
+        """The scans of the queries, each with its true pose; None in an unknown place."""
+        for position in self.split.queries:
+            record = self.asked.records[position]
+            if record.scan is not None:
+                yield record.scan, None if self.protocol == "P4" else record.pose
+
 
 @dataclass(frozen=True)
 class Estimate:

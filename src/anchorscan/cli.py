@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from .io import Log
     from .pose import Pose2D
     from .record import Record
+    from .reference import Reference
     from .reference_set import ReferenceSet, SetInfo
     from .settings import Settings
 
@@ -374,6 +375,65 @@ def explain(
 
 @app.command()
 @_guarded
+def report(
+    run_file: Annotated[
+        Path,
+        typer.Argument(
+            metavar="RUN", help="What locate or track wrote, or the folder that bench wrote."
+        ),
+    ],
+    output: Annotated[
+        Path, typer.Option("--output", "-o", metavar="HTML", help="The page to write.")
+    ],
+    set_file: Annotated[
+        Path | None,
+        typer.Option("--set", metavar="SET", help="The set that the run was made with: its map."),
+    ] = None,
+    logs: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--log", metavar="LOG", help="The log that was located: its scans and true poses."
+        ),
+    ] = None,
+    most: Annotated[
+        int, typer.Option(min=1, metavar="N", help="Queries that can be stepped through.")
+    ] = 2000,
+    field_of_view: FieldOfViewOption = None,
+    range_max: RangeMaxOption = None,
+    topic: TopicOption = None,
+    upside_down: UpsideDownOption = False,
+) -> None:
+    """Show a run as one HTML page that opens from disk: map, every query, figures, worst first.
+
+    Poses of the log, where it has any, are taken for the truth.
+    """
+    from .answers import read_runs
+    from .report import write_report
+
+    runs = read_runs(run_file)
+    reading = _reading(field_of_view, range_max, topic, upside_down)
+    opened = {_stem(path): _open_log(path, reading) for path in logs or ()}
+    references: tuple[Reference, ...] = ()
+    if set_file is not None:
+        from .reference_set import ReferenceSet
+
+        with ReferenceSet.open(set_file) as places:
+            references = places.references
+    names = [path.name for path in (run_file, set_file, *(logs or ())) if path is not None]
+    write_report(
+        output,
+        runs,
+        references,
+        {name: log.__iter__ for name, log in opened.items()},
+        title=", ".join(names),
+        most=most,
+    )
+    count = sum(len(run.answers) for run in runs)
+    _say(f"{output}: {count} answers, {output.stat().st_size / 1e6:.1f} MB")
+
+
+@app.command()
+@_guarded
 def info(
     set_file: SetArgument,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
@@ -457,6 +517,47 @@ def bench(
 
 @app.command()
 @_guarded
+def calibrate(
+    logs: Annotated[
+        list[str] | None,
+        typer.Argument(
+            metavar="[BUILDING=]LOG...", help="Logs with poses; those in ANCHORSCAN_DATA if none."
+        ),
+    ] = None,
+    preset: PresetOption = None,
+    settings_file: SettingsOption = None,
+    queries: Annotated[
+        int, typer.Option(min=1, metavar="N", help="At most so many queries of each split.")
+    ] = 200,
+) -> None:
+    """Fit what an answer's evidence is worth, each building scored by the others.
+
+    Prints the coefficients for the settings file's section "decision".
+    """
+    from . import benchmark, calibration
+
+    settings = _read_settings(preset or (None if settings_file else "default"), settings_file)
+    assert settings is not None
+    cases = benchmark.tasks(benchmark.read_drives(logs or benchmark.default_logs()))
+    samples = calibration.gather(cases, settings, queries, _say)
+    typer.echo("scored by the fit to the other buildings:")
+    scored = calibration.rotate(samples, settings.decision.threshold)
+    for fit in (fit for fit in scored if fit.protocol != "P4"):
+        typer.echo(
+            f"{fit.protocol} {fit.place}: {fit.queries} queries, recall {fit.recall:.3f} at 100 % "
+            f"and {fit.recall_99:.3f} at 99 % precision, calibration error "
+            f"{fit.calibration_error:.3f}, {fit.accepted_wrong} of {fit.accepted} answers wrong"
+        )
+    unknown = [fit for fit in scored if fit.protocol == "P4"]
+    typer.echo(
+        f"P4, {len(unknown)} pairs of buildings: {sum(fit.accepted for fit in unknown)} of "
+        f"{sum(fit.queries for fit in unknown)} queries answered"
+    )
+    typer.echo(json.dumps({"decision": calibration.weigh(samples)}, indent=2))
+
+
+@app.command()
+@_guarded
 def check_map(
     map_file: Annotated[Path, typer.Argument(metavar="MAP", help="YAML file of a map.")],
     log: LogArgument,
@@ -478,6 +579,18 @@ def check_map(
     settings = _read_settings(preset, settings_file)
     opened = _open_log(log, _reading(None, range_max, topic, upside_down))
     run(map_file, opened, output, settings, say=typer.echo, progress=_progress)
+
+
+@app.command(context_settings={"allow_extra_args": True, "ignore_unknown_options": True})
+@_guarded
+def ros(context: typer.Context) -> None:
+    """Run the ROS 2 node: tell a robot where it is, as soon as it is known.
+
+    All words are passed on to ROS: anchorscan ros --ros-args -p base_frame_id:=base_link
+    """
+    from .ros_node import main
+
+    main(context.args, autostart=True)
 
 
 @app.command()
@@ -538,6 +651,11 @@ def _map_records(
         sensor = replace(sensor, range_max=range_max)
     grid = load_map(path)
     return _progress(reference_scans(grid, sensor, spacing=spacing, heading=heading), "simulating")
+
+
+def _stem(path: Path) -> str:
+    """Return the name of a log without what says how it is packed."""
+    return path.name.partition(".")[0]
 
 
 def _record(log: Log, index: int) -> Record:

@@ -8,6 +8,7 @@ and the value is the one that did best on the logs named in the module that uses
 from __future__ import annotations
 
 import difflib
+import json
 import math
 import types
 from collections.abc import Mapping
@@ -121,15 +122,18 @@ class Settings(BaseModel):
 
     @classmethod
     def from_json(cls, text: str | bytes) -> Settings:
-        """Read settings from JSON; what is left out has its default.
+        """Read settings from JSON; what is left out is as in the default preset.
 
         Raises:
             SettingsError: The text is no JSON, a name is unknown or a value impossible.
         """
         try:
-            return cls.model_validate_json(text)
-        except ValidationError as error:  # the text is no JSON; the rest is explained below
-            raise SettingsError(_explanation(cls, error)) from None
+            changes = json.loads(text)
+        except (ValueError, RecursionError) as error:
+            raise SettingsError(f"settings are not JSON: {error}") from None
+        if not isinstance(changes, dict):
+            raise SettingsError("settings are a JSON object with a section per stage")
+        return cls.preset().changed(changes)
 
     def to_json(self) -> str:
         """Write all settings as JSON."""

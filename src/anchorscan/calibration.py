@@ -1,0 +1,199 @@
+"""Fitting the decision: what the evidence of a query is worth, on buildings other than scored.
+
+Every query of every split gives the evidence of its best fit (see ``decision.py``) and whether
+that fit was right.  A logistic regression with a small ridge maps one to the other.  To say
+how the fit does on a building that it has not seen, each building in turn is left out of the
+fit, as a place of references and as a place of queries, and scored with what the others gave.
+
+Splits weigh with the square root of their queries, so that a long drive does not outvote the
+rest; sparse references (P2) and unknown places (P4) weigh less, since users see them less.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .decision import evidence
+from .matcher import Matcher
+from .pose import Pose2D
+from .protocol import CORRECT_HEADING, CORRECT_POSITION, recall_at_precision, reliability
+from .reference import Reference
+from .scan import LaserScan
+from .settings import Settings
+
+__all__ = ["Case", "Fit", "Sample", "fit", "gather", "rotate", "weigh"]
+
+_PROTOCOL_WEIGHTS = {"P1": 1.0, "P2": 0.5, "P3": 1.0, "P4": 0.3}
+_RIDGE = 0.02
+_STEPS = 50
+_COEFFICIENTS = ("constant", "log_margin", "explained", "through")
+
+
+class Case(Protocol):
+    """A split to take evidence from."""
+
+    @property
+    def protocol(self) -> str:
+        """P1, P2, P3 or P4."""
+
+    @property
+    def place(self) -> str:
+        """What tables call it."""
+
+    @property
+    def buildings(self) -> tuple[str, ...]:
+        """Of the references and of the queries."""
+
+    @property
+    def references(self) -> Sequence[Reference]:
+        """The references, with poses."""
+
+    @property
+    def queries(self) -> Iterable[tuple[LaserScan, Pose2D | None]]:
+        """Scans, each with its true pose; None in an unknown place."""
+
+
+@dataclass(frozen=True, eq=False)
+class Sample:
+    """The evidence of the queries of one split.
+
+    Args:
+        protocol: "P1" to "P4".
+        place: What tables call it.
+        buildings: Of the references and of the queries.
+        evidence: (N, 4) of the best fit of each query.
+        correct: (N,) whether that fit was right.
+    """
+
+    protocol: str
+    place: str
+    buildings: tuple[str, ...]
+    evidence: NDArray[np.float64]
+    correct: NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Fit:
+    """What a sample looks like to coefficients.
+
+    Args:
+        protocol: "P1" to "P4".
+        place: What tables call it.
+        queries: Their count.
+        recall: Recall at 100 % precision.
+        recall_99: Recall at 99 % precision.
+        calibration_error: Expected calibration error over ten bins.
+        accepted_wrong: Wrong answers at the threshold of the settings.
+        accepted: Answers at that threshold.
+    """
+
+    protocol: str
+    place: str
+    queries: int
+    recall: float
+    recall_99: float
+    calibration_error: float
+    accepted_wrong: int
+    accepted: int
+
+
+def gather(
+    cases: Iterable[Case], settings: Settings, queries: int, say: Callable[[str], None]
+) -> list[Sample]:
+    """Locate the queries of every case and keep the evidence.
+
+    Args:
+        cases: The splits.
+        settings: Of the matcher; its method must be the map.
+        queries: At most so many of each split, at equal steps.
+        say: Told what was gathered.
+    """
+    samples = []
+    for case in cases:
+        matcher = Matcher(case.references, settings)
+        asked = list(case.queries)
+        rows, right = [], []
+        for scan, truth in asked[:: max(1, len(asked) // queries)]:
+            search = matcher.explain(scan).in_map
+            if search is not None and len(search.fits):
+                rows.append(evidence(search.fits))
+                right.append(_is_right(search.fits.poses[0], truth))
+        sample = Sample(
+            case.protocol, case.place, case.buildings, np.array(rows), np.array(right, bool)
+        )
+        say(f"{case.protocol} {case.place}: {sum(right)} of {len(right)} right")
+        if rows:
+            samples.append(sample)
+    return samples
+
+
+def weigh(samples: Sequence[Sample]) -> dict[str, float]:
+    """Fit the coefficients of ``DecisionSettings`` to samples."""
+    return dict(zip(_COEFFICIENTS, _logistic(samples).tolist(), strict=True))
+
+
+def rotate(samples: Sequence[Sample], threshold: float) -> list[Fit]:
+    """Score every sample by what the samples of other buildings gave."""
+    fits = []
+    for sample in samples:
+        others = [s for s in samples if not set(s.buildings) & set(sample.buildings)]
+        if others:
+            fits.append(fit(sample, _logistic(others), threshold))
+    return fits
+
+
+def fit(sample: Sample, coefficients: NDArray[np.float64], threshold: float) -> Fit:
+    """Score one sample by given coefficients."""
+    probability = 1.0 / (1.0 + np.exp(-(sample.evidence @ coefficients)))
+    accepted = probability >= threshold
+    return Fit(
+        sample.protocol,
+        sample.place,
+        len(sample.correct),
+        recall_at_precision(probability, sample.correct)[0],
+        recall_at_precision(probability, sample.correct, 0.99)[0],
+        reliability(probability, sample.correct).error,
+        int(np.sum(accepted & ~sample.correct)),
+        int(np.sum(accepted)),
+    )
+
+
+def _is_right(pose: NDArray[np.float64], truth: Pose2D | None) -> bool:
+    if truth is None:
+        return False
+    found = Pose2D.from_array(pose)
+    return found.distance(truth) <= CORRECT_POSITION and found.turn(truth) <= CORRECT_HEADING
+
+
+def _logistic(samples: Sequence[Sample]) -> NDArray[np.float64]:
+    """Ridge-regularised logistic regression by Newton's method."""
+    x = np.concatenate([sample.evidence for sample in samples])
+    y = np.concatenate([sample.correct for sample in samples]).astype(np.float64)
+    weights = np.concatenate(
+        [
+            np.full(
+                len(sample.correct),
+                _PROTOCOL_WEIGHTS[sample.protocol] / math.sqrt(len(sample.correct)),
+            )
+            for sample in samples
+        ]
+    )
+    weights *= len(weights) / weights.sum()
+    coefficients = np.zeros(x.shape[1])
+    for _ in range(_STEPS):
+        # Bounded, so that separable samples do not run away between steps.
+        p = 1.0 / (1.0 + np.exp(-np.clip(x @ coefficients, -30.0, 30.0)))
+        gradient = x.T @ (weights * (p - y)) + 2.0 * _RIDGE * coefficients
+        curvature = (x.T * (weights * np.maximum(p * (1.0 - p), 1e-6))) @ x
+        step = np.linalg.solve(curvature + 2.0 * _RIDGE * np.eye(x.shape[1]), gradient)
+        step *= min(1.0, 2.0 / max(float(np.abs(step).max()), 1e-12))
+        coefficients = coefficients - step
+        if float(np.abs(step).max()) < 1e-9:
+            break
+    return coefficients
