@@ -25,7 +25,7 @@ ORDER = (
     *("description", "pairwise", "stitched_map", "matcher"),
     *("set_file", "set_directory", "reference_set", "localizer"),
     *("robot", "robot_parameters", "mailbox"),
-    *("explanation", "drawing"),
+    *("explanation", "drawing", "answers"),
     *("sensor", "occupancy", "map_file", "world", "building", "simulator", "exhaustive_search"),
     *("karto_matcher", "stage_times", "scoreboard"),
 )
