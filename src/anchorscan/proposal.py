@@ -59,7 +59,7 @@ class ProposalSettings(BaseModel):
     longest_edge: float = Field(15.0, gt=0.0, description="relations that are used, metres")
     length_tolerance: float = Field(0.1, gt=0.0, description="corresponding lengths, metres")
     direction_tolerance: float = Field(
-        math.radians(25.0), gt=0.0, description="direction at an anchor to its edge, radians"
+        math.radians(20.0), gt=0.0, description="direction at an anchor to its edge, radians"
     )
     heading_tolerance: float = Field(
         math.radians(10.0), gt=0.0, description="edge to main angles, radians"

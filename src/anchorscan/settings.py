@@ -50,6 +50,7 @@ _MAP: Mapping[str, Any] = {
         "facing": True,
         "most_main_angles": 1,
     },
+    "acceptance": {"hypotheses": 3},
 }
 
 # The paper's method with its five candidates.  The figures that it does not name were chosen on

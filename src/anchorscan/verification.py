@@ -34,10 +34,10 @@ class VerificationSettings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    second_readings: int = Field(32, ge=4, description="readings of the second check")
+    second_readings: int = Field(28, ge=4, description="readings of the second check")
     third_readings: int = Field(80, ge=4, description="readings of the third check")
-    third_poses: int = Field(50, ge=1, description="poses that reach the third check")
-    fits: int = Field(8, ge=1, description="distinct poses that are refined")
+    third_poses: int = Field(40, ge=1, description="poses that reach the third check")
+    fits: int = Field(7, ge=1, description="distinct poses that are refined")
     fit_readings: int = Field(72, ge=4, description="readings of the refinement")
     iterations: int = Field(8, ge=0, description="steps of the refinement")
     distinct_distance: float = Field(0.4, gt=0.0, description="poses nearer are one, metres")
