@@ -2,14 +2,21 @@
 
 numba's disk cache raises at import where no cache folder is writable (containers,
 read-only installations); there a kernel is compiled anew in every process instead.
+
+numba takes a cached kernel for current as long as its own file is unchanged, although the
+kernels and constants that it uses from other files are compiled into it.  So the stamp of a
+kernel's file is joined here with the stamps of what its module imports.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from enum import EnumMeta
+from hashlib import blake2b
 from typing import Any
 
 import numba
+from numba.core.dispatcher import Dispatcher
 
 __all__ = ["kernel"]
 
@@ -17,6 +24,26 @@ __all__ = ["kernel"]
 def kernel(function: Callable[..., Any]) -> Any:
     """Compile ``function`` without Python objects, cached on disk where that is possible."""
     try:
-        return numba.njit(cache=True, nogil=True, error_model="numpy")(function)
-    except RuntimeError:
+        compiled: Any = numba.njit(cache=True, nogil=True, error_model="numpy")(function)
+        file = compiled._cache._cache_file
+        file._source_stamp = (file._source_stamp, _borrowed(function.__globals__))
+    except (RuntimeError, AttributeError):  # AttributeError: a numba that caches in another way
         return numba.njit(nogil=True, error_model="numpy")(function)
+    return compiled
+
+
+def _borrowed(names: Mapping[str, Any]) -> str:
+    """Sign the numbers and the kernels that a module knows so far, its imports above all."""
+    signature = blake2b(digest_size=16)
+    for name, value in sorted(names.items()):
+        if isinstance(value, Dispatcher):
+            cache_file = getattr(getattr(value, "_cache", None), "_cache_file", None)
+            held: Any = getattr(cache_file, "_source_stamp", None)
+        elif isinstance(value, EnumMeta):
+            held = list(value.__members__.items())
+        elif isinstance(value, (bool, int, float, tuple)):
+            held = value
+        else:
+            continue
+        signature.update(f"{name}={held!r}\n".encode())
+    return signature.hexdigest()
