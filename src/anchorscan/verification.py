@@ -76,6 +76,15 @@ class Fits:
     def __len__(self) -> int:
         return len(self.poses)
 
+    def __getitem__(self, chosen: slice) -> Fits:
+        """Return some of the fits."""
+        return Fits(
+            self.poses[chosen],
+            self.features[chosen],
+            self.hessians[chosen],
+            self.residuals[chosen],
+        )
+
 
 def verify(
     poses: NDArray[np.float64],
