@@ -11,7 +11,7 @@ import csv
 import gzip
 import json
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import groupby
 from pathlib import Path
@@ -21,9 +21,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .errors import LogError
+from .hypothesis import Hypothesis
 from .pose import Pose2D
+from .record import Record
 
-__all__ = ["Guess", "Run", "ScanAnswer", "read_runs"]
+__all__ = ["Guess", "Run", "ScanAnswer", "read_line", "read_runs"]
 
 _TABLE = "answers.csv"
 _COLUMNS = ("protocol", "place", "method", "query", "x", "y", "theta", "probability", "seconds")
@@ -75,6 +77,32 @@ class ScanAnswer:
     seconds: float = math.nan
     reason: str = ""
     truth: Pose2D | None = None
+
+    @classmethod
+    def of(cls, record: Record, hypotheses: Sequence[Hypothesis], seconds: float) -> ScanAnswer:
+        """Make one of what the library answered.
+
+        Args:
+            record: Whose scan was located.
+            hypotheses: Best first.
+            seconds: How long it took.
+        """
+        guesses = tuple(
+            Guess(
+                each.pose,
+                each.probability,
+                each.reference,
+                each.pose_in_reference,
+                each.covariance,
+                each.evaluation,
+                each.quality,
+                each.score,
+            )
+            for each in hypotheses
+        )
+        accepted = bool(hypotheses) and hypotheses[0].accepted
+        reason = "" if guesses else record.problem or "no reading is a return"
+        return cls(record.index, accepted, guesses, record.stamp, seconds, reason)
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,6 +158,18 @@ def _text(path: Path) -> str:
 # JSON lines
 
 
+def read_line(line: str) -> ScanAnswer:
+    """Read one line of ``locate`` or ``track``.
+
+    Raises:
+        ValueError: It is none.
+    """
+    try:
+        return _answer(json.loads(line))
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        raise ValueError(f"no answer: {type(error).__name__}: {error}") from None
+
+
 def _lines_run(path: Path, text: str) -> list[Run]:
     answers, problems = [], []
     kinds = set()
@@ -137,11 +177,11 @@ def _lines_run(path: Path, text: str) -> list[Run]:
         if not line.strip():
             continue
         try:
-            values = json.loads(line)
-            answers.append(_answer(values))
-            kinds.add("locate" if "hypotheses" in values else "track")
-        except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-            problems.append((number, f"no answer: {type(error).__name__}: {error}"))
+            answers.append(read_line(line))
+        except ValueError as error:
+            problems.append((number, str(error)))
+        else:
+            kinds.add("locate" if '"hypotheses"' in line else "track")
     kind = "locate" if "locate" in kinds else "track"
     return [Run(kind, path.stem.removesuffix(".jsonl"), tuple(answers), "", tuple(problems))]
 

@@ -30,6 +30,7 @@ from . import __version__
 from .errors import AnchorscanError, LogError, SettingsError
 
 if TYPE_CHECKING:
+    from .answers import ScanAnswer
     from .hypothesis import Hypothesis
     from .io import Log
     from .pose import Pose2D
@@ -434,6 +435,54 @@ def report(
 
 @app.command()
 @_guarded
+def view(
+    set_file: SetArgument,
+    log: LogArgument,
+    run_file: Annotated[
+        str | None,
+        typer.Option(
+            "--run",
+            metavar="RUN|-",
+            help="Answers of locate or track to show, '-' as they come on stdin; else scans are "
+            "located now.",
+        ),
+    ] = None,
+    output: Annotated[
+        Path | None,
+        typer.Option("--output", "-o", metavar="RRD", help="Save to a file, open no window."),
+    ] = None,
+    field_of_view: FieldOfViewOption = None,
+    range_max: RangeMaxOption = None,
+    topic: TopicOption = None,
+    upside_down: UpsideDownOption = False,
+    preset: PresetOption = None,
+    settings_file: SettingsOption = None,
+) -> None:
+    """Show answers with Rerun: map, scan, anchor points, hypotheses, belief over time.
+
+    Live: anchorscan track SET LOG | anchorscan view SET LOG --run -
+    """
+    from .reference_set import ReferenceSet
+    from .viewer import Viewer
+
+    opened = _open_log(log, _reading(field_of_view, range_max, topic, upside_down))
+    records = _progress(_records(opened), "showing", opened.count)
+    with ReferenceSet.open(set_file, settings=_read_settings(preset, settings_file)) as places:
+        answers = None if run_file is None else _read_answers(run_file)
+        shown = 0
+        with Viewer(places.references, places.settings, output) as viewer:
+            for record in records:
+                answer = (
+                    _answer_now(places, record) if answers is None else answers.get(record.index)
+                )
+                if answer is not None:
+                    viewer.show(record, answer)
+                    shown += 1
+    _say(f"{log}: {shown} scans shown{'' if output is None else f' in {output}'}")
+
+
+@app.command()
+@_guarded
 def info(
     set_file: SetArgument,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
@@ -651,6 +700,47 @@ def _map_records(
         sensor = replace(sensor, range_max=range_max)
     grid = load_map(path)
     return _progress(reference_scans(grid, sensor, spacing=spacing, heading=heading), "simulating")
+
+
+def _answer_now(places: ReferenceSet, record: Record) -> ScanAnswer:
+    """Locate the scan of a record."""
+    from .answers import ScanAnswer
+
+    start = time.perf_counter()
+    found = [] if record.scan is None else places.locate(record.scan)
+    return ScanAnswer.of(record, found, time.perf_counter() - start)
+
+
+class _Answers:
+    """Answers by the number of their scan, in the order in which they come."""
+
+    def __init__(self, answers: Iterator[ScanAnswer]) -> None:
+        self._answers = answers
+        self._next = next(answers, None)
+
+    def get(self, scan: int) -> ScanAnswer | None:
+        """Return the answer to a scan; numbers must be asked for in rising order."""
+        while self._next is not None and self._next.scan < scan:
+            self._next = next(self._answers, None)
+        found = self._next
+        return found if found is not None and found.scan == scan else None
+
+
+def _read_answers(run_file: str) -> _Answers:
+    """Read the answers of a run, or take them from stdin as they come."""
+    from .answers import read_line, read_runs
+
+    if run_file != "-":
+        return _Answers(iter(read_runs(Path(run_file))[0].answers))
+
+    def lines() -> Iterator[ScanAnswer]:
+        for number, line in enumerate(sys.stdin, start=1):
+            try:
+                yield read_line(line)
+            except ValueError as error:
+                raise LogError(str(error), "<stdin>", number) from None
+
+    return _Answers(lines())
 
 
 def _stem(path: Path) -> str:
