@@ -8,11 +8,14 @@ that the best fit is right is a logistic function of three numbers:
     -log(1 - s)     of its score s: how much of the scan the map explains,
     sqrt(through)   of the share of rays that pass through known surfaces.
 
+The scans behind this have 120 readings or more.  Fewer can agree by chance, so that up to ten
+are held not to, the fewer there are the more.
+
 This is the probability of the right *place*.  A scan of few readings, or of a plain corridor, may
 be explained without a rest and still not hold the pose: so the probability is multiplied by how
-much of the pose's covariance lies within what counts as correct.  On the development logs that
-changes no answer, since what was answered there is held to 9 cm in 99 of 100 cases; without
-it a scan with a single reading is an answer.
+much of the pose's covariance lies within what counts as correct.  On the development logs
+neither changes an answer, since what was answered there is held to 9 cm in 99 of 100 cases;
+without them a scan with a single reading is an answer.
 
 What is left goes to the other fits and to "somewhere else", in proportion to
 ``exp(rivalry * score)``; "somewhere else" competes with a fixed score.
@@ -38,6 +41,7 @@ __all__ = ["Decision", "DecisionSettings", "covariance", "decide", "evidence", "
 
 _SCORE, _THROUGH = FEATURES.index("score"), FEATURES.index("through")
 _SMALLEST_MARGIN, _LARGEST_SCORE = 0.002, 0.995
+_MANY_READINGS, _LUCKY_READINGS = 120, 10.0
 _CORRECT_POSITION, _CORRECT_HEADING = 0.5, math.radians(10.0)
 
 
@@ -89,7 +93,9 @@ def evidence(fits: Fits) -> NDArray[np.float64]:
     score = float(fits.features[0, _SCORE])
     rival = float(fits.features[1, _SCORE]) if len(fits) > 1 else 0.5 * score
     margin = max(score - rival, _SMALLEST_MARGIN)
-    explained = -math.log(1.0 - min(score, _LARGEST_SCORE))
+    rest = 1.0 - min(score, _LARGEST_SCORE)
+    rest += _LUCKY_READINGS * max(0.0, 1.0 / fits.readings - 1.0 / _MANY_READINGS)
+    explained = -math.log(rest)
     through = float(fits.features[0, _THROUGH])
     return np.array([1.0, math.log(margin), explained, math.sqrt(through)])
 

@@ -66,12 +66,14 @@ class Fits:
         hessians: (F, 3, 3) of the refinement, per metre and radian squared.
         residuals: (F,) mean squared distance of the readings that have a surface near, metres
             squared.
+        readings: How many readings the shares are of.
     """
 
     poses: NDArray[np.float64]
     features: NDArray[np.float64]
     hessians: NDArray[np.float64]
     residuals: NDArray[np.float64]
+    readings: int
 
     def __len__(self) -> int:
         return len(self.poses)
@@ -83,6 +85,7 @@ class Fits:
             self.features[chosen],
             self.hessians[chosen],
             self.residuals[chosen],
+            self.readings,
         )
 
 
@@ -114,7 +117,10 @@ def verify(
     places = (settings.place_distance, settings.place_turn)
     rays = (settings.rays, settings.through_margin, settings.followed)
     steps = (settings.fit_readings, settings.iterations, settings.last_readings)
-    return Fits(*_fit(chosen, points, tiles, weights, steps, places, rays))
+    readings = min(len(points), settings.last_readings)
+    found = _fit(chosen, points, tiles, weights, steps, places, rays)
+    poses, features, hessians, residuals = found
+    return Fits(poses, features, hessians, residuals, readings)
 
 
 @kernel
