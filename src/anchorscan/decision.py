@@ -50,11 +50,11 @@ class DecisionSettings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    constant: float = Field(0.59, description="of the logistic function")
-    log_margin: float = Field(1.44, description="weight of the logarithm of the margin")
-    explained: float = Field(2.76, description="weight of -log(1 - score)")
+    constant: float = Field(0.46, description="of the logistic function")
+    log_margin: float = Field(1.34, description="weight of the logarithm of the margin")
+    explained: float = Field(2.61, description="weight of -log(1 - score)")
     through: float = Field(
-        -5.34, description="weight of the root of the share of rays that see through"
+        -5.06, description="weight of the root of the share of rays that see through"
     )
     rivalry: float = Field(30.0, gt=0.0, description="of the fits for what the best leaves")
     elsewhere: float = Field(0.8, description="score with which 'somewhere else' competes")

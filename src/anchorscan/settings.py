@@ -81,10 +81,10 @@ PRESETS: Mapping[str, Mapping[str, Any]] = types.MappingProxyType(
                 "rays": 180,
             },
             "decision": {
-                "constant": 1.16,
-                "log_margin": 1.54,
-                "explained": 2.71,
-                "through": -5.78,
+                "constant": 1.02,
+                "log_margin": 1.39,
+                "explained": 2.55,
+                "through": -6.2,
             },
         },
     }
