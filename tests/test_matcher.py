@@ -54,13 +54,14 @@ def test_a_scan_located_against_itself_is_where_it_was_taken(seed):
     _, places, scans = building(seed)
     matcher = Matcher(references_of(places, scans), PAPER)
     for place, scan in zip(places, scans, strict=True):
-        best = matcher.locate(scan, "all")[0]
+        hypotheses = matcher.locate(scan, "all")
         if len(matcher.explain(scan).description.graph) < 3:
             continue  # two anchors may as well be laid on one another the other way round
-        assert best.evaluation == 1.0
-        assert best.pose.distance(place) < 1e-3
-        assert best.pose.turn(place) < 1e-3
-        assert best.accepted
+        assert hypotheses[0].evaluation == 1.0
+        assert hypotheses[0].accepted
+        # e_m cannot tell a perfect look-alike from the place itself: both are best then.
+        best = [each.pose for each in hypotheses if each.evaluation == 1.0]
+        assert any(pose.distance(place) < 1e-3 and pose.turn(place) < 1e-3 for pose in best)
 
 
 @settings(deadline=None, max_examples=20)
