@@ -32,7 +32,18 @@ ORDER = (
 VALUES = {"errors", "pose", "scan", "record", "reference"}
 # Imported by nobody, but for the command line, which loads them inside its commands.
 LEAVES = {
-    *("benchmark", "calibration", "report", "figures", "viewer", "demo", "map_check", "ros_node", "cli"),
+    *(
+        "ablation",
+        "benchmark",
+        "calibration",
+        "report",
+        "figures",
+        "viewer",
+        "demo",
+        "map_check",
+        "ros_node",
+        "cli",
+    ),
     "__main__",
 }
 SILENT = {"print", "exit", "quit", "breakpoint", "input"}

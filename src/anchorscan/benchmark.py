@@ -169,6 +169,11 @@ class Task:
         return self.known.building, self.asked.building
 
     @property
+    def looks_alike(self) -> bool:
+        """Whether no single scan can be sure there."""
+        return self.known.name in _LOOK_ALIKE
+
+    @property
     def queries(self) -> Iterator[tuple[LaserScan, Pose2D | None]]:
         """The scans of the queries, each with its true pose; None in an unknown place."""
         for position in self.split.queries:

@@ -607,6 +607,36 @@ def calibrate(
 
 @app.command()
 @_guarded
+def ablate(
+    logs: Annotated[
+        list[str] | None,
+        typer.Argument(
+            metavar="[BUILDING=]LOG...", help="Logs with poses; those in ANCHORSCAN_DATA if none."
+        ),
+    ] = None,
+    preset: PresetOption = None,
+    settings_file: SettingsOption = None,
+    queries: Annotated[
+        int, typer.Option(min=1, metavar="N", help="At most so many queries of each split.")
+    ] = 100,
+    changes: Annotated[
+        list[str] | None,
+        typer.Option("--change", metavar="NAME", help="Again for more; all if none is named."),
+    ] = None,
+) -> None:
+    """Change one thing at a time, and say what each is worth: a table in Markdown."""
+    from . import ablation, benchmark
+
+    chosen = ablation.changes_named(changes or ())
+    settings = _read_settings(preset or (None if settings_file else "default"), settings_file)
+    assert settings is not None
+    drives = benchmark.read_drives(logs or benchmark.default_logs(_say))
+    cases = benchmark.tasks(drives, ("P1", "P2", "P3"))
+    ablation.run(cases, settings, queries, typer.echo, chosen)
+
+
+@app.command()
+@_guarded
 def check_map(
     map_file: Annotated[Path, typer.Argument(metavar="MAP", help="YAML file of a map.")],
     log: LogArgument,
