@@ -104,20 +104,24 @@ def test_at_most_so_many_queries_are_asked(case):
 
 def test_the_table_of_a_simulated_building(case):
     said: list[str] = []
-    chosen = changes_named(["no refinement", "1 candidate"])
+    chosen = changes_named(["no refinement", "edges not oriented", "1 candidate"])
     outcomes = run([case], DEFAULT, 100, said.append, chosen)
-    assert [line.split(" | ")[0] for line in said[:5]] == [
+    assert [line.split(" | ")[0] for line in said[:6]] == [
         "| change",
         "| ---",
         "| no change",
         "| no refinement",
+        "| edges not oriented",
         "| 1 candidate",
     ]
-    assert len({line.count("|") for line in said[:5]}) == 1
+    assert len({line.count("|") for line in said[:6]}) == 1
     assert said[2].endswith(" | 1.00 |")
-    assert said[-2:] == [f"- {change.name}: {change.reason}" for change in chosen]
+    assert said[-3:] == [f"- {change.name}: {change.reason}" for change in chosen]
     # One reference that may propose cannot propose more than all do.
-    usual, _, single = outcomes
+    usual, still, directionless, single = outcomes
+    np.testing.assert_array_equal(still.proposals, usual.proposals)
+    assert directionless.proposals.mean() > usual.proposals.mean()
+    assert single.proposals.mean() < usual.proposals.mean()
     assert single.among.sum() <= usual.among.sum()
     assert not np.array_equal(single.probability, usual.probability)
 
@@ -127,10 +131,11 @@ def test_a_row_pools_each_kind_of_split_by_itself():
     right = np.array([True, True, True, False, False, True])
     among = np.array([True, True, True, True, False, True])
     probability = np.array([0.9, 0.8, 0.3, 0.5, 0.9, 0.1])
-    usual = Outcome(groups, right, among, probability, np.full(6, 0.002))
-    slow = Outcome(groups, right, among, probability, np.full(6, 0.005))
+    proposals = np.array([10, 20, 30, 40, 0, 20])
+    usual = Outcome(groups, right, among, probability, proposals, np.full(6, 0.002))
+    slow = Outcome(groups, right, among, probability, proposals, np.full(6, 0.005))
     figures = ["0.750", "1.000", "0.500", "-", "-", "-", "0.500", "0.500", "0.000"]
-    assert row("slow", slow, usual) == f"| slow | {' | '.join(figures)} | 2.50 |"
+    assert row("slow", slow, usual) == f"| slow | {' | '.join(figures)} | 20 | 2.50 |"
     assert header()[0].count("|") == row("slow", slow, usual).count("|")
 
 

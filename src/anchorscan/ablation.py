@@ -3,7 +3,8 @@
 Every change of `CHANGES` switches a part off, or moves a figure that was chosen, in otherwise
 unchanged settings.  All changes are asked the same queries, and make one row of a table each:
 the pooled figures of the protocol, the share of queries with the right pose among the fits
-(what a perfect decision would make of them), and processor time against no change.
+(what a perfect decision would make of them), the mean number of proposals, and processor time
+against no change.
 
 The coefficients of the decision stay those of the settings, which were fitted with every part
 in place.  So a change can look a little worse than it would be with coefficients of its own;
@@ -229,6 +230,7 @@ class Outcome:
         right: (N,) whether the best hypothesis is correct.
         among: (N,) whether the right pose is among the fits.
         probability: (N,) of the best hypothesis, NaN for none.
+        proposals: (N,) alignments proposed before any check.
         seconds: (N,) of processor time.
     """
 
@@ -236,6 +238,7 @@ class Outcome:
     right: NDArray[np.bool_]
     among: NDArray[np.bool_]
     probability: NDArray[np.float64]
+    proposals: NDArray[np.float64]
     seconds: NDArray[np.float64]
 
 
@@ -310,12 +313,15 @@ def attempt(cases: Sequence[Case], settings: Settings, queries: int) -> Outcome:
             matcher.locate(scan)  # the first query relates the landmarks
         for index in thin(range(len(asked)), queries):
             rows.append((_group(case), *_ask(matcher, *asked[index])))
-    groups, right, among, probability, seconds = zip(*rows, strict=True) if rows else [()] * 5
+    groups, right, among, probability, proposed, seconds = (
+        zip(*rows, strict=True) if rows else [()] * 6
+    )
     return Outcome(
         np.array(groups, np.int64),
         np.array(right, bool),
         np.array(among, bool),
         np.array(probability, float),
+        np.array(proposed, float),
         np.array(seconds, float),
     )
 
@@ -324,7 +330,7 @@ def header() -> tuple[str, str]:
     """Return the first two lines of the table."""
     figures = ("top-1", "among the fits", "recall at 99 %")
     cells = ["change"] + [f"{group}: {figure}" for group in _GROUPS for figure in figures]
-    cells.append("time")
+    cells += ["proposals", "time"]
     return _line(cells), _line(["---"] + ["---:"] * (len(cells) - 1))
 
 
@@ -340,6 +346,7 @@ def row(name: str, outcome: Outcome, usual: Outcome) -> str:
     for group in range(len(_GROUPS)):
         member = outcome.groups == group
         cells += _figures(outcome, member) if member.any() else ["-"] * 3
+    cells.append(f"{outcome.proposals.mean():.0f}")
     cells.append(f"{outcome.seconds.sum() / usual.seconds.sum():.2f}")
     return _line(cells)
 
@@ -353,17 +360,18 @@ def _group(case: Case) -> int:
 
 def _ask(
     matcher: Matcher, scan: LaserScan, truth: Pose2D | None
-) -> tuple[bool, bool, float, float]:
+) -> tuple[bool, bool, float, int, float]:
     fresh = replace(scan)  # nothing derived may be left over in it
     start = time.process_time()
     trace = matcher.explain(fresh)
     seconds = time.process_time() - start
-    fits = () if trace.in_map is None else trace.in_map.fits.poses
-    among = any(_is_right(Pose2D.from_array(pose), truth) for pose in fits)
-    if not trace.hypotheses:
-        return False, among, math.nan, seconds
+    search = trace.in_map
+    if search is None or not trace.hypotheses:
+        return False, False, math.nan, 0, seconds
     best = trace.hypotheses[0]
-    return _is_right(best.pose, truth), among, best.probability, seconds
+    among = any(_is_right(Pose2D.from_array(pose), truth) for pose in search.fits.poses)
+    proposed = search.proposals.proposed
+    return _is_right(best.pose, truth), among, best.probability, proposed, seconds
 
 
 def _is_right(pose: Pose2D | None, truth: Pose2D | None) -> bool:
