@@ -1,4 +1,4 @@
-# The six verbs: setup, check, test, bench, docs, release; and the demo. CI calls the same ones.
+# The six verbs: setup, check, test, bench, docs, release; the demo, and the test with ROS. CI calls the same ones.
 # Nothing is needed beforehand but Python 3.10 or later: every verb sets up .venv by itself.
 
 PYTHON ?= python3
@@ -7,10 +7,10 @@ BIN := $(VENV)/bin
 PYTEST_ARGS ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help setup check test bench docs release demo picture lock clean
+.PHONY: help setup check test ros-test bench docs release demo picture lock clean
 
 help: ## show this list
-	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "  make %-9s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-9s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
 
 setup: $(VENV)/.ready ## make .venv with the package (editable) and the pinned tools
 
@@ -31,6 +31,20 @@ check: setup ## lint, format and types
 
 test: check ## check, then every test
 	$(BIN)/python -m pytest $(PYTEST_ARGS)
+
+ros-test: $(VENV)-ros/.ready ## the ROS 2 node on the wire, in an environment of its own
+	ANCHORSCAN_REQUIRE_ROS=1 $(VENV)-ros/bin/python -m pytest tests/ros $(PYTEST_ARGS)
+
+# Linux only.  These wheels start every Python of their environment anew: keep it to itself.
+$(VENV)-ros/.ready: requirements-ros.txt pyproject.toml
+	$(PYTHON) -m venv $(VENV)-ros 2>/dev/null || { \
+		$(PYTHON) -m venv --clear --without-pip $(VENV)-ros && \
+		$(PYTHON) -m pip --python $(VENV)-ros/bin/python install --quiet pip; }
+	$(VENV)-ros/bin/python -m pip install --quiet --disable-pip-version-check --require-hashes \
+		-r requirements-ros.txt
+	$(VENV)-ros/bin/python -m pip install --quiet --disable-pip-version-check --no-deps \
+		--no-build-isolation -e .
+	@touch $@
 
 bench: setup ## the protocols on the logs in ANCHORSCAN_DATA
 	$(BIN)/anchorscan bench
@@ -54,11 +68,14 @@ demo: setup ## build a map of MIT Killian Court and locate later visits in it
 picture: setup ## draw the picture of the README again
 	$(BIN)/anchorscan demo --output docs/images
 
-lock: setup ## resolve requirements-dev.txt anew, for Python 3.10 and later
+lock: setup ## resolve the pinned requirements anew, for Python 3.10 and later
 	$(BIN)/python -m pip install --quiet uv
 	$(BIN)/uv pip compile --quiet --upgrade --universal --python-version 3.10 --all-extras \
 		--generate-hashes --no-emit-index-url --custom-compile-command "make lock" \
 		pyproject.toml --output-file requirements-dev.txt
+	$(BIN)/uv pip compile --quiet --upgrade --python-version 3.10 --extra bags --extra maps \
+		--generate-hashes --no-emit-index-url --custom-compile-command "make lock" \
+		pyproject.toml requirements-ros.in --output-file requirements-ros.txt
 
 clean: ## remove what the verbs made
-	rm -rf $(VENV) $(VENV)-release site dist build .mypy_cache .ruff_cache .pytest_cache
+	rm -rf $(VENV) $(VENV)-release $(VENV)-ros site dist build .mypy_cache .ruff_cache .pytest_cache

@@ -32,7 +32,7 @@ def places() -> ReferenceSet:
     )
 
 
-@settings(max_examples=60)
+@settings(max_examples=40)
 @given(
     count=st.integers(1, 12),
     start=st.floats(-math.pi, math.pi),

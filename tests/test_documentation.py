@@ -84,7 +84,7 @@ def test_commands_run(
 ) -> None:
     """Run the commands of anchorscan; those of make must be verbs of the Makefile."""
     (somewhere / "office.apr").unlink()
-    verbs = re.findall(r"^(\w+):.*## ", (ROOT / "Makefile").read_text(encoding="utf-8"), re.M)
+    verbs = re.findall(r"^([\w-]+):.*## ", (ROOT / "Makefile").read_text(encoding="utf-8"), re.M)
     for line in re.split(r"\n|&&", text):
         words = shlex.split(line, comments=True)
         if words[:1] == ["make"]:

@@ -60,9 +60,13 @@ class Player:
         odom_frame: str = "odom",
         jump: float = 0.0,
         odometry: bool = True,
+        heard: bool = True,
     ) -> float:
         """Publish scans and odometry of a recording; gives the time of the last scan."""
         kept = np.load(file)
+        end = time.monotonic() + 30.0
+        while heard and not self.scan.get_subscription_count() and time.monotonic() < end:
+            time.sleep(0.05)
         stamp = math.nan
         for k in range(*slice(first, last).indices(len(kept["stamps"]))):
             stamp = float(kept["stamps"][k]) + offset

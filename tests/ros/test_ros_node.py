@@ -167,7 +167,7 @@ def start(tmp_path: Path) -> Iterator[Start]:
         assert "Traceback" not in log, log
 
 
-def awake(observer: Observer, **changes: bool) -> None:
+def awake(observer: Observer) -> None:
     assert observer.change("configure")
     assert observer.change("activate")
 
@@ -441,7 +441,7 @@ def test_a_set_file_takes_the_place_of_a_map(
     robot = start(player)
     observer.listen()
     awake(observer)
-    robot.tell(do="play", file=recording.path, last=5)
+    robot.tell(do="play", file=recording.path, last=5, heard=False)
     assert observer.values()["scans scans"] == "0"
     robot.kill()
     assert observer.change("deactivate")

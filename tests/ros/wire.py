@@ -156,8 +156,9 @@ class Observer:
             client = self.node.create_client(kind, f"/anchorscan/{name}")
             self._clients[name] = client
         assert client.wait_for_service(seconds), f"there is no service {name}"
-        # What was killed is believed to live for a while, and to it requests go astray.
-        for patience in (10.0, 10.0, seconds):
+        # What was killed is believed to live for a while, and to it requests go astray; but a
+        # transition that is asked for twice fails.
+        for patience in (seconds,) if kind is ChangeState else (5.0, 5.0, seconds):
             future = client.call_async(request)
             with suppress(AssertionError):
                 self.wait(future.done, "", patience)
