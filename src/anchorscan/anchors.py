@@ -4,11 +4,15 @@ An anchor point is a position that another scan of the same place finds again.
 
 *Jump edge* anchors stand at the near surface's margin where the range jumps from near to
 far.  At the visibility rim of a round object the ray grazes the surface; there the angle
-between ray and surface is too small and no anchor is made.
+between ray and surface is too small and no anchor is made.  (At a range r, with s radians
+between rays, the last reading on a radius R is still seen under up to sqrt(2 r s / R); so
+small or far pillars do get anchors.)  Nor is there an edge where a plain wall only seems to
+end: along a corridor, where its readings come to lie too far apart to be joined, and at the
+reach of the sensor.
 
 *Angle* anchors stand where two surfaces meet: the surface angle changes within a segment.
 The position is the intersection of the two lines fitted to either side, not the nearest
-reading.
+reading.  The surfaces part between two readings, so that no reading counts for both.
 
 *Virtual edge* anchors combine the peaks of the x- and the y-histogram: the distributions
 of the scan's points along the main angle and across it.  Every further peak of the angle
@@ -56,6 +60,9 @@ __all__ = [
     "virtual_edges",
 ]
 
+# Walls farther than this, metres, are no part of the place.
+_FARTHEST_WALL = 500.0
+
 
 class AnchorKind(IntEnum):
     """What an anchor point is; left and right as seen from the sensor."""
@@ -84,7 +91,7 @@ class AnchorSettings(BaseModel):
     shortest_arm: float = Field(0.2, gt=0.0, description="shortest such way, metres")
     flatness: float = Field(0.04, gt=0.0, description="largest rms error of such a line, metres")
     farthest_corner: float = Field(
-        0.2, gt=0.0, description="intersection to nearest reading, metres"
+        0.2, gt=0.0, description="intersection to the readings on either side, metres"
     )
     histogram_bin: float = Field(0.1, gt=0.0, description="bin of the x- and y-histograms, metres")
     smallest_wall: float = Field(0.8, gt=0.0, description="surface that makes a peak, metres")
@@ -175,10 +182,17 @@ def jump_edge_anchors(
         angles.points,
         angles.gaps,
         angles.way,
+        angles.surface,
         angles.moments,
         surfaces.first,
         surfaces.last,
-        (settings.arm, settings.shortest_arm, settings.flatness, settings.smallest_rim_angle),
+        (
+            settings.arm,
+            settings.shortest_arm,
+            settings.flatness,
+            settings.smallest_rim_angle,
+            angles.reach,
+        ),
     )
     return rows
 
@@ -238,22 +252,22 @@ def virtual_edges(angles: AngleFunction, settings: AnchorSettings) -> list[Virtu
 
 
 @kernel
-def _jump_edges(points, gaps, way, moments, first, last, limits):  # type: ignore[no-untyped-def]
+def _jump_edges(points, gaps, way, surface, moments, first, last, limits):  # type: ignore[no-untyped-def]
     """Margins of large surfaces behind which the range jumps to far."""
-    arm, shortest, flatness, rim = limits
+    arm, shortest, flatness, rim, reach = limits
     rows = np.empty((2 * len(first), 4))
     found = 0
     for s in range(len(first)):
         a, b = first[s], last[s]
         for side in range(2):
-            at = b if side == 0 else a
+            at, out = (b, 1) if side == 0 else (a, -1)
             gap = gaps[b] if side == 0 else gaps[a - 1]
             near = TO_FAR if side == 0 else TO_NEAR
             if gap not in (near, FREE):
                 continue
             other = at
             while other != (a if side == 0 else b) and abs(way[other] - way[at]) < arm:
-                other += -1 if side == 0 else 1
+                other -= out
             if abs(way[other] - way[at]) < shortest:
                 continue
             begin, end = min(at, other), max(at, other)
@@ -261,11 +275,24 @@ def _jump_edges(points, gaps, way, moments, first, last, limits):  # type: ignor
             _, _, ux, uy, error = line_through(moments, begin, end, dx, dy)
             if error > flatness:
                 continue
-            across = abs(ux * points[at, 1] - uy * points[at, 0])
-            if across < math.sin(rim) * math.hypot(points[at, 0], points[at, 1]):
+            # The surface right at the margin: the line bends with a round object's.
+            ex, ey = math.cos(surface[at]), math.sin(surface[at])
+            x, y = points[at, 0], points[at, 1]
+            if not abs(ex * y - ey * x) >= math.sin(rim) * math.hypot(x, y):
                 continue
-            rows[found, 0] = points[at, 0]
-            rows[found, 1] = points[at, 1]
+            # A surface that goes on beyond the reach, or behind readings too far apart to be
+            # joined, has no edge there.
+            if gap == FREE:
+                step = 2.0 * abs(ux * (x - points[at - out, 0]) + uy * (y - points[at - out, 1]))
+                if math.hypot(x + out * step * ux, y + out * step * uy) > reach:
+                    continue
+            else:
+                behind = (at + out) % len(points)
+                across = ux * (points[behind, 1] - y) - uy * (points[behind, 0] - x)
+                if abs(across) <= flatness:
+                    continue
+            rows[found, 0] = x
+            rows[found, 1] = y
             rows[found, 2] = math.atan2(ux, -uy)
             rows[found, 3] = side
             found += 1
@@ -273,8 +300,22 @@ def _jump_edges(points, gaps, way, moments, first, last, limits):  # type: ignor
 
 
 @kernel
+def _distance_to_chord(x, y, a, b):  # type: ignore[no-untyped-def]
+    """Distance from a position to the straight line from ``a`` to ``b``, metres."""
+    dx, dy = b[0] - a[0], b[1] - a[1]
+    square = dx * dx + dy * dy
+    along = ((x - a[0]) * dx + (y - a[1]) * dy) / square if square > 0.0 else 0.0
+    along = min(max(along, 0.0), 1.0)
+    return math.hypot(x - a[0] - along * dx, y - a[1] - along * dy)
+
+
+@kernel
 def _angle_anchors(points, way, moments, first, last, limits):  # type: ignore[no-untyped-def]
-    """Places within large surfaces where the surface angle changes."""
+    """Places within large surfaces where the surface angle changes.
+
+    Every place between two readings may be one; the lines of the surfaces before and behind it
+    are fitted to the readings up to the one and from the other on.
+    """
     arm, shortest, flatness, smallest_turn, farthest = limits
     straightest, sharpest = math.cos(smallest_turn), math.cos(0.95 * math.pi)
     rows = np.empty((len(points), 4))
@@ -284,35 +325,36 @@ def _angle_anchors(points, way, moments, first, last, limits):  # type: ignore[n
         begin = first[s]
         end = begin
         previous = found
-        for i in range(first[s] + 1, last[s]):
-            while way[i] - way[begin] > arm and i - begin > 1:
+        for i in range(first[s], last[s]):
+            j = i + 1
+            while way[i] - way[begin + 1] >= arm:
                 begin += 1
-            end = max(end, i + 1)
-            while end < last[s] and way[end] - way[i] < arm:
+            end = max(end, j)
+            while end < last[s] and way[end] - way[j] < arm:
                 end += 1
-            if way[i] - way[begin] < shortest or way[end] - way[i] < shortest:
+            if way[i] - way[begin] < shortest or way[end] - way[j] < shortest:
                 continue
-            if end - i < 2 or i - begin < 2:
+            if end - j < 2 or i - begin < 2:
                 continue
-            ax, ay, au, av, error = line_through(
+            ax, ay, au, av, before = line_through(
                 moments, begin, i, points[i, 0] - points[begin, 0], points[i, 1] - points[begin, 1]
             )
-            if error > flatness:
+            if before > flatness:
                 continue
-            bx, by, bu, bv, error = line_through(
-                moments, i, end, points[end, 0] - points[i, 0], points[end, 1] - points[i, 1]
+            bx, by, bu, bv, after = line_through(
+                moments, j, end, points[end, 0] - points[j, 0], points[end, 1] - points[j, 1]
             )
             dot = au * bu + av * bv
-            if error > flatness or dot > straightest or dot < sharpest:
+            if after > flatness or dot > straightest or dot < sharpest:
                 continue
             cross = au * bv - av * bu
             along = ((bx - ax) * bv - (by - ay) * bu) / cross
             x, y = ax + along * au, ay + along * av
-            off = math.hypot(x - points[i, 0], y - points[i, 1])
+            off = _distance_to_chord(x, y, points[i], points[j])
             if off > farthest:
                 continue
             turn = math.atan2(cross, dot)
-            quality = abs(turn) / smallest_turn - off / farthest
+            quality = abs(turn) / smallest_turn - off / farthest - (before + after) / flatness
             if (
                 found > previous
                 and math.hypot(rows[found - 1, 0] - x, rows[found - 1, 1] - y) < arm
@@ -372,21 +414,28 @@ def _main_angles(surface, weights, bins, most, share):  # type: ignore[no-untype
 
 
 @kernel
+def _makes_wall(point, surface):  # type: ignore[no-untyped-def]
+    """Whether a return shows a surface, and one that is not farther than any building's."""
+    return not math.isnan(surface) and max(abs(point[0]), abs(point[1])) < _FARTHEST_WALL
+
+
+@kernel
 def _wall_histograms(points, surface, weights, main, width, wall_angle, facing):  # type: ignore[no-untyped-def]
     """Length of surface over x and over y of the wall frame, per side that is seen."""
     c, s = math.cos(main), math.sin(main)
     low, high = 0.0, 0.0
     for i in range(len(points)):
-        x = c * points[i, 0] + s * points[i, 1]
-        y = c * points[i, 1] - s * points[i, 0]
-        low = min(low, x, y)
-        high = max(high, x, y)
+        if _makes_wall(points[i], surface[i]):
+            x = c * points[i, 0] + s * points[i, 1]
+            y = c * points[i, 1] - s * points[i, 0]
+            low = min(low, x, y)
+            high = max(high, x, y)
     origin = (math.floor(low / width) - 2.0) * width
     bins = int(math.ceil((high - origin) / width)) + 3
     histograms = np.zeros((2, 2, bins))
     near = math.cos(wall_angle)
     for i in range(len(points)):
-        if surface[i] != surface[i]:
+        if not _makes_wall(points[i], surface[i]):
             continue
         # The free space lies on the left of the way along the surface.
         normal = surface[i] + 0.5 * math.pi - main
@@ -426,7 +475,7 @@ def _walls(histograms, limits, facing):  # type: ignore[no-untyped-def]
             rows[found, 1] = (1.0 - 2.0 * side) if facing else 0.0
             rows[found, 2] = total
             found += 1
-    order = np.argsort(-rows[:found, 2])[:most]
+    order = np.argsort(-rows[:found, 2], kind="mergesort")[:most]
     return rows[order]
 
 

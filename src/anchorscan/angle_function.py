@@ -11,6 +11,9 @@ is kept modulo 360 degrees, as the direction in which the surface is *walked* wi
 free space on the left; modulo 180 degrees it is the paper's angle.  With
 ``fitted=True`` the angle is that of the line fitted to all readings between the pair
 instead of the chord, which lowers its noise at no cost (prefix sums).
+
+The way between two readings is that of a chord over so many readings around them that it is
+longer than the noise: the way of a zigzag would make near surfaces longer than far ones.
 """
 
 from __future__ import annotations
@@ -65,12 +68,14 @@ class AngleFunction:
             ``TO_NEAR``, ``FREE`` or ``UNKNOWN``.  The last entry speaks of the first
             return only where the scan is a full turn.
         runs: (V,) index of the first return of the connected run that each belongs to.
-        way: (V,) way along the surface since the first return, gaps left out, metres.
+        way: (V,) way along the surface since the first return, gaps left out, metres; where
+            readings are nearer to each other than their noise, without the zigzag of that.
         surface: (V,) direction of the surface, radians in (-pi, pi]; NaN where a run is
             too short to tell.
         extents: (V,) length of surface that the return stands for, metres.
         moments: (V + 1, 5) running sums of x, y, xx, xy, yy, from which any stretch of
             returns has its fitted line in constant time.
+        reach: Longest range that counts, metres.
     """
 
     points: NDArray[np.float64]
@@ -82,6 +87,7 @@ class AngleFunction:
     surface: NDArray[np.float64]
     extents: NDArray[np.float64]
     moments: NDArray[np.float64]
+    reach: float
 
 
 def angle_function(scan: LaserScan, settings: AngleFunctionSettings) -> AngleFunction:
@@ -111,9 +117,11 @@ def angle_function(scan: LaserScan, settings: AngleFunctionSettings) -> AngleFun
     )
     if scan.is_full_turn and len(beams):
         points, ranges, beams, gaps = _begin_at_gap(points, ranges, beams, gaps)
-    runs, way, extents, moments = _runs(points, gaps)
+    runs, way, extents, moments = _runs(points, ranges, gaps, step, settings.noise)
     surface = _surface(points, runs, way, moments, settings.baseline, settings.fitted)
-    return AngleFunction(points, ranges, beams, gaps, runs, way, surface, extents, moments)
+    return AngleFunction(
+        points, ranges, beams, gaps, runs, way, surface, extents, moments, scan.range_max
+    )
 
 
 def angle_histogram(angles: AngleFunction, settings: AngleFunctionSettings) -> NDArray[np.float64]:
@@ -258,12 +266,11 @@ def _begin_at_gap(points, ranges, beams, gaps):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _runs(points, gaps):  # type: ignore[no-untyped-def]
+def _runs(points, ranges, gaps, step, noise):  # type: ignore[no-untyped-def]
     """Connected runs, way along them, surface length per return, and running moments."""
     count = len(points)
     runs = np.zeros(count, np.int64)
-    way = np.zeros(count)
-    extents = np.zeros(count)
+    ends = np.full(count, count - 1)
     moments = np.zeros((count + 1, 5))
     for i in range(count):
         x, y = points[i, 0], points[i, 1]
@@ -272,16 +279,25 @@ def _runs(points, gaps):  # type: ignore[no-untyped-def]
         moments[i + 1, 2] = moments[i, 2] + x * x
         moments[i + 1, 3] = moments[i, 3] + x * y
         moments[i + 1, 4] = moments[i, 4] + y * y
-        if i == 0:
-            continue
-        runs[i] = i
+        if i > 0:
+            runs[i] = runs[i - 1] if gaps[i - 1] == CONNECTED else i
+    for i in range(count - 2, -1, -1):
+        ends[i] = ends[i + 1] if runs[i + 1] == runs[i] else i
+    way = np.zeros(count)
+    extents = np.zeros(count)
+    for i in range(1, count):
         way[i] = way[i - 1]
-        if gaps[i - 1] == CONNECTED:
-            step = math.hypot(x - points[i - 1, 0], y - points[i - 1, 1])
-            runs[i] = runs[i - 1]
-            way[i] += step
-            extents[i - 1] += 0.5 * step
-            extents[i] += 0.5 * step
+        if runs[i] != runs[i - 1]:
+            continue
+        # Over so many readings that the way is longer than what noise adds to it.
+        spread = noise / (min(ranges[i - 1], ranges[i]) * step)
+        wide = int(math.ceil(0.5 * (min(spread, 1e6) - 1.0)))
+        wide = max(min(wide, i - 1 - runs[i], ends[i] - i), 0)
+        a, b = points[i - 1 - wide], points[i + wide]
+        length = math.hypot(b[0] - a[0], b[1] - a[1]) / (2 * wide + 1)
+        way[i] += length
+        extents[i - 1] += 0.5 * length
+        extents[i] += 0.5 * length
     return runs, way, extents, moments
 
 
