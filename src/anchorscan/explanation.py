@@ -331,16 +331,23 @@ def centres_of_cells(points: NDArray[np.float64], cell: float) -> NDArray[np.flo
 
 
 def bounds_of(
-    points: NDArray[np.float64], always: NDArray[np.float64] | None = None
+    points: NDArray[np.float64],
+    always: NDArray[np.float64] | None = None,
+    stray: float = _OUTLIERS,
 ) -> tuple[float, float, float, float]:
     """Give the rectangle that holds nearly all of (N, 2) points, and all of some others.
+
+    Args:
+        points: Metres; a few far ones may be left out.
+        always: (M, 2) metres, all inside.
+        stray: Percent of the points that may be left out on each side.
 
     Returns:
         Smallest x, largest x, smallest y, largest y, metres.
     """
     corners = [np.empty((0, 2)) if always is None else always.reshape(-1, 2)]
     if len(points):
-        corners.append(np.percentile(points, (_OUTLIERS, 100.0 - _OUTLIERS), axis=0))
+        corners.append(np.percentile(points, (stray, 100.0 - stray), axis=0))
     both = np.concatenate(corners)
     if not len(both):
         return -1.0, 1.0, -1.0, 1.0

@@ -68,6 +68,8 @@ _DASHED = (0, (4, 3))
 _MOST_VOTES = 12
 _MOST_FITS = 9
 _MOST_NUMBERS = 30
+# Percent of a scan's readings that may lie outside its picture, on each side.
+_STRAY = 2.5
 # Anchor points that an answer lays no farther apart are taken for the same, metres.
 _ONE_THING = 0.3
 # A reading so near to a surface of the map lies on it, metres.
@@ -141,7 +143,7 @@ def _draw_angle_function(explanation: Explanation, theme: Theme) -> Figure:
     """Figure 1 of the paper: the scan and its anchor points beside its angle function."""
     known = explanation.trace.description
     anchors = known.anchors
-    bounds = bounds_of(known.angles.points, _with_sensor(anchors.positions))
+    bounds = bounds_of(known.angles.points, _with_sensor(anchors.positions), _STRAY)
     title = "Sections 2 and 3: angle function and anchor points"
     figure = new_figure((11.0, _height(bounds, 4.8) + 1.1), title)
     left, right = figure.subplots(1, 2, width_ratios=(1.0, 1.25))
@@ -250,7 +252,7 @@ def _crossings(edges: VirtualEdges) -> NDArray[np.float64]:
 
 def _bounds_of_walls(angles: AngleFunction, edges: VirtualEdges) -> Bounds:
     points = Pose2D(0.0, 0.0, -edges.main_angle).apply(angles.points)
-    return bounds_of(points, _with_sensor(_crossings(edges)))
+    return bounds_of(points, _with_sensor(_crossings(edges)), _STRAY)
 
 
 def _plot_histograms(axes: Axes, edges: VirtualEdges, theme: Theme) -> tuple[Axes, Axes]:
@@ -347,6 +349,7 @@ def _draw_graphs(explanation: Explanation, theme: Theme) -> Figure:
     bounds = bounds_of(
         np.concatenate([theirs.angles.points, ours.angles.points]),
         _with_sensor(np.concatenate([theirs.anchors.positions, ours.anchors.positions])),
+        _STRAY,
     )
     title = "Section 4: two anchor graphs and the edges they share"
     figure = new_figure((11.0, _height(bounds, 5.2) + 1.2), title)
@@ -507,9 +510,9 @@ def _draw_overlay(explanation: Explanation, theme: Theme) -> Figure:
     _plot_both_scans(left, explanation, theme)
     view(left, bounds)
     ruler(left, theme)
-    left.set_title(f"squares: the {overview}, which has the better overview; dots: the {front}")
+    left.set_title(f"squares: the {overview}, with the better overview\ndots: the {front}")
     _plot_ranges(right, comparison, theme)
-    right.set_title(f"beams of the {front}: e = {e_m:.2f} of its readings agree")
+    right.set_title(f"beams of the {front}: a share e = {e_m:.2f} of its readings agrees")
     counts = np.bincount(comparison.readings, minlength=len(Reading))
     legend(
         figure,
@@ -556,7 +559,8 @@ def _bounds_of_both(explanation: Explanation) -> Bounds:
     )
     both = np.concatenate([_overview_points(explanation), T_reference_front.apply(front.points)])
     T_reference_scan = explanation.trace.hypotheses[0].pose_in_reference
-    return bounds_of(both, _with_sensor(np.array([[T_reference_scan.x, T_reference_scan.y]])))
+    lasers = _with_sensor(np.array([[T_reference_scan.x, T_reference_scan.y]]))
+    return bounds_of(both, lasers, _STRAY)
 
 
 def _plot_ranges(axes: Axes, comparison: Comparison, theme: Theme) -> None:
@@ -641,7 +645,7 @@ def _plot_fit(axes: Axes, explanation: Explanation, theme: Theme) -> None:
     best = explanation.trace.hypotheses[0]
     pose = best.pose or Pose2D()
     points = pose.apply(explanation.trace.description.angles.points)
-    bounds = bounds_of(points, np.array([[pose.x, pose.y]]))
+    bounds = bounds_of(points, np.array([[pose.x, pose.y]]), _STRAY)
     plot_map(axes, picture_of_map(explanation.field, bounds), theme, shaded=True)
     distance, is_free = map_at(explanation.field, points)
     near = distance <= _ON_SURFACE
@@ -658,9 +662,11 @@ def _plot_fit(axes: Axes, explanation: Explanation, theme: Theme) -> None:
     _plot_truth(axes, explanation, theme)
     view(axes, bounds)
     ruler(axes, theme)
-    axes.set_title(
-        f"best fit: {near.sum()} readings on surfaces, {contrary.sum()} in free space, "
-        f"{unknown.sum()} unknown"
+    axes.set_title("the scan at the best fit")
+    axes.set_xlabel(
+        f"readings: {near.sum()} on surfaces, {contrary.sum()} in free space, "
+        f"{unknown.sum()} unknown",
+        fontsize=8,
     )
 
 
@@ -679,7 +685,7 @@ def _plot_worth(axes: Axes, search: MapSearch, theme: Theme) -> None:
     axes.set_xticks([0.0, 0.5, 1.0])
     axes.set_xlabel("score of the fit")
     verdict = "accepted" if search.decision.accepted else "“not known”"
-    axes.set_title(f"{verdict}; p elsewhere = {search.decision.elsewhere:.3f}")
+    axes.set_title(f"{verdict}\np elsewhere = {search.decision.elsewhere:.3f}")
 
 
 PICTURES: Mapping[str, Callable[[Explanation, Theme], Figure]] = {
@@ -762,8 +768,7 @@ def _same_things(pairing: Pairing, anchors: AnchorPoints) -> list[tuple[int, int
     theirs = pairing.description.anchors
     moved = pairing.hypothesis.pose_in_reference.apply(anchors.positions)
     apart = np.linalg.norm(theirs.positions[:, np.newaxis] - moved[np.newaxis], axis=2)
-    same = (apart <= _ONE_THING) & (theirs.kinds[:, np.newaxis] == anchors.kinds[np.newaxis])
-    return [(row, column) for row, column in np.argwhere(same).tolist()]
+    return [(row, column) for row, column in np.argwhere(apart <= _ONE_THING).tolist()]
 
 
 def _ends(scan: LaserScan, pose: Pose2D) -> NDArray[np.float64]:
