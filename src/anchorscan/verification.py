@@ -20,10 +20,18 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from ._jit import kernel
 from .angle_function import wrapped
-from .field import Tiles, cell_code, field_scores, normal_equations, passed_through, refined
+from .field import (
+    Tiles,
+    _solved,
+    cell_code,
+    field_scores,
+    normal_equations,
+    passed_through,
+    refined,
+)
 from .proposal import spread
 
-__all__ = ["FEATURES", "Fits", "VerificationSettings", "verify"]
+__all__ = ["FEATURES", "Fits", "VerificationSettings", "follow", "verify"]
 
 # What is told of every fit: shares of the readings.
 FEATURES = ("score", "near", "close", "free", "unknown", "through", "off")
@@ -123,6 +131,37 @@ def verify(
     return Fits(poses, features, hessians, residuals, readings)
 
 
+def follow(
+    poses: NDArray[np.float64],
+    stiffness: NDArray[np.float64],
+    points: NDArray[np.float64],
+    tiles: Tiles,
+    weights: NDArray[np.float32],
+    settings: VerificationSettings,
+) -> Fits:
+    """Refine (K, 3) expected poses, each held back by how sure the expectation is.
+
+    The robust squared distances of the readings and the square of the move, weighed with the
+    stiffness, are made smallest together: along a plain corridor, where no reading holds the
+    pose, it stays where it was expected.
+
+    Args:
+        poses: T_set_laser, metres and radians.
+        stiffness: (K, 3, 3) inverse covariance of each, times the variance of a reading.
+        points: (N, 2) end points of the scan's returns, metres, scan frame.
+        tiles: The stitched map.
+        weights: (256,) score of a reading by the byte of its cell.
+        settings: How many readings and steps.
+
+    Returns:
+        A fit for every pose, in their order; rays are followed for all of them.
+    """
+    steps = (settings.fit_readings, settings.iterations, settings.last_readings)
+    rays = (settings.rays, settings.through_margin)
+    found = _follow(poses, stiffness, points, tiles, weights, steps, rays)
+    return Fits(*found, min(len(points), settings.last_readings))
+
+
 @kernel
 def _sieve(poses, points, tiles, weights, sieves):  # type: ignore[no-untyped-def]
     """The best distinct poses by more and more readings."""
@@ -206,3 +245,49 @@ def _fit(poses, points, tiles, weights, steps, places, rays):  # type: ignore[no
         hessians[k] = hessian
         residuals[k] = squares / max(total, 1.0)
     return moved, features, hessians, residuals
+
+
+@kernel
+def _follow(poses, stiffness, points, tiles, weights, steps, rays):  # type: ignore[no-untyped-def]
+    """Refine every expected pose and take all its numbers."""
+    count = len(poses)
+    moved = np.empty((count, 3))
+    features = np.empty((count, 7))
+    hessians = np.empty((count, 3, 3))
+    residuals = np.empty(count)
+    few = spread(points, steps[0])
+    many = spread(points, steps[2])
+    followed = spread(points, rays[0])
+    for k in range(count):
+        moved[k] = _held_back(poses[k], stiffness[k], few, tiles, steps[1])
+        _features(moved[k], many, tiles, weights, features[k])
+        features[k, 5] = passed_through(moved[k], followed, tiles, rays[1])
+        hessian, _, squares, total = normal_equations(moved[k], few, tiles, 0.1)
+        hessians[k] = hessian
+        residuals[k] = squares / max(total, 1.0)
+    return moved, features, hessians, residuals
+
+
+@kernel
+def _held_back(pose, stiffness, points, tiles, iterations):  # type: ignore[no-untyped-def]
+    """Move a pose as `refined` does, drawn back to where it was by a stiffness."""
+    moved = pose.copy()
+    for step in range(iterations):
+        scale = 0.2 if 2 * step < iterations else 0.1
+        hessian, gradient, _, _ = normal_equations(moved, points, tiles, scale)
+        off = moved - pose
+        off[2] = wrapped(off[2])
+        for i in range(3):
+            for j in range(3):
+                gradient[i] += stiffness[i, j] * off[j]
+                hessian[i, j] += stiffness[i, j]
+        x, y, theta = _solved(hessian, gradient, 1.0)
+        size = math.hypot(x, y)
+        share = 1.0 if size < 0.1 else 0.1 / size
+        moved[0] -= share * x
+        moved[1] -= share * y
+        moved[2] -= share * theta
+        if size < 0.002 and abs(theta) < 0.0005 and 2 * step >= iterations:
+            break
+    moved[2] = wrapped(moved[2])
+    return moved
