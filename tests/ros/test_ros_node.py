@@ -136,6 +136,9 @@ def other_recording(folder: Path) -> Recording:
 
 @pytest.fixture(scope="module")
 def ros() -> Iterator[None]:
+    # Compile once here, without a limit of time, what the nodes then take from the cache.
+    with ReferenceSet() as places:
+        places.prepare()
     rclpy.init()
     yield
     rclpy.shutdown()
