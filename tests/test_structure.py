@@ -21,7 +21,8 @@ ROOT = PACKAGE.parents[1]
 ORDER = (
     *("errors", "pose", "scan", "record", "reference", "protocol", "journey", "_jit"),
     *("angle_function", "segments", "anchors", "graph", "database", "alignment"),
-    *("field", "proposal", "verification", "evaluation", "hypothesis", "decision", "settings"),
+    *("field", "proposal", "verification", "evaluation", "hypothesis", "decision"),
+    *("motion", "belief", "settings"),
     *("description", "pairwise", "stitched_map", "matcher"),
     *("set_file", "set_directory", "reference_set", "localizer"),
     *("robot", "robot_parameters", "mailbox"),

@@ -49,8 +49,12 @@ from .set_file import (
 )
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
     from .matcher import Candidates, Matcher, Trace
     from .settings import Settings
+    from .verification import Fits
 
 __all__ = ["ReferenceSet", "SetInfo"]
 
@@ -452,6 +456,16 @@ class ReferenceSet:
     def explain(self, scan: LaserScan, candidates: Candidates = None) -> Trace:
         """Do what ``locate`` does and return every intermediate value."""
         return self._prepared().explain(scan, candidates)
+
+    def follow(
+        self, scan: LaserScan, poses: NDArray[np.float64], stiffness: NDArray[np.float64]
+    ) -> Fits:
+        """Refine poses that are expected, as ``Matcher.follow`` does."""
+        return self._prepared().follow(scan, poses, stiffness)
+
+    def nearest(self, poses: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """Name the reference taken nearest to each pose, as ``Matcher.nearest`` does."""
+        return self._prepared().nearest(poses)
 
     def prepare(self) -> None:
         """Do now what the first query would wait for: derive the index, compile kernels."""

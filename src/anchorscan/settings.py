@@ -25,6 +25,7 @@ from pydantic import (
 
 from .alignment import AlignmentSettings
 from .anchors import AnchorSettings
+from .belief import BeliefSettings
 from .database import DatabaseSettings
 from .decision import DecisionSettings
 from .errors import SettingsError
@@ -109,6 +110,7 @@ class Settings(BaseModel):
     proposal: ProposalSettings = ProposalSettings()
     verification: VerificationSettings = VerificationSettings()
     decision: DecisionSettings = DecisionSettings()
+    belief: BeliefSettings = BeliefSettings()
 
     @classmethod
     def preset(cls, name: str = "default") -> Settings:

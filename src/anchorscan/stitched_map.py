@@ -27,7 +27,7 @@ from .pose import Pose2D
 from .proposal import Landmarks, Proposals, joined, landmarks, proposals
 from .scan import LaserScan
 from .settings import Settings
-from .verification import Fits, verify
+from .verification import Fits, follow, verify
 
 __all__ = ["MapSearch", "StitchedMap"]
 
@@ -120,6 +120,22 @@ class StitchedMap:
         decision = decide(fits, settings.decision)
         hypotheses = self._hypotheses(description, fits, decision)
         return MapSearch(votes, proposed, fits, decision, hypotheses)
+
+    def follow(
+        self, scan: LaserScan, poses: NDArray[np.float64], stiffness: NDArray[np.float64]
+    ) -> Fits:
+        """Refine expected poses of a scan, as `verification.follow` does."""
+        settings = self._settings.verification
+        return follow(poses, stiffness, scan.points, self._field.tiles, self._weights, settings)
+
+    def nearest(self, poses: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """Return the identifier of the reference taken nearest to each of (K, 3) poses.
+
+        Returns:
+            (K,) identifiers and (K, 3) ``T_reference_laser``.
+        """
+        nearest, T_reference_scan = _stand_for(self._poses, poses)
+        return self._identifiers[nearest], T_reference_scan
 
     def _hypotheses(
         self, description: Description, fits: Fits, decision: Decision

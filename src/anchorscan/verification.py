@@ -159,7 +159,9 @@ def follow(
     steps = (settings.fit_readings, settings.iterations, settings.last_readings)
     rays = (settings.rays, settings.through_margin)
     found = _follow(poses, stiffness, points, tiles, weights, steps, rays)
-    return Fits(*found, min(len(points), settings.last_readings))
+    moved, features, hessians, residuals = found
+    readings = min(len(points), settings.last_readings)
+    return Fits(moved, features, hessians, residuals, readings)
 
 
 @kernel

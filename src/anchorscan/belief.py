@@ -1,0 +1,391 @@
+"""Where a robot may be: places with weights, moved by odometry and weighed by every scan.
+
+The paper's hypotheses are meant to feed probabilistic localization.  Here they feed a mixture of
+Gaussians over poses, a few dozen *places*, and two weights for the rest of the world:
+
+    unsearched  anywhere; the next search for the scan in the map says where,
+    nowhere     searched and not found: outside of the map, or where no proposal leads.
+
+A scan weighs a place by the share s of its readings that the map explains from there.  On the
+recorded drives the odds of a place against any other place grow as
+
+    u = likelihood * (log(1 / (1 - s)) - log(1 / (1 - s0)))  -  see_through * through,
+
+where s0 is the score with which the rest of the world competes and ``through`` the share of
+rays that pass through known surfaces.  Readings that end where nobody looked say nothing, so
+that a robot may leave the map and come back.  A scan that people block is not taken against a
+place where all that it still shows is explained: there u is raised to ``benefit``.
+
+Scans that follow each other err together.  If u wavers around its mean over a way L, the odds
+after a drive are those of the mean of the first and the last scan and of the integral of u over
+the way in units of 2 L (the likelihood ratio of an Ornstein-Uhlenbeck process).  So every place
+has a *weight*, which collects u along the way, and a *support*, which is of the latest scan
+alone: standing still proves nothing, and a robot that is carried away is doubted at once.
+
+The constants are fitted on the development logs; the page on the belief says how.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field
+
+from ._jit import kernel
+from .angle_function import wrapped
+from .motion import Motion, MotionSettings
+from .verification import FEATURES, Fits
+
+__all__ = [
+    "BeliefSettings",
+    "Mixture",
+    "admitted",
+    "log_odds",
+    "moved",
+    "nothing_known",
+    "probabilities",
+    "stiffness",
+    "tidied",
+    "weighed",
+]
+
+_SCORE, _CLOSE, _FREE, _UNKNOWN, _THROUGH = (
+    FEATURES.index(name) for name in ("score", "close", "free", "unknown", "through")
+)
+_LARGEST_SCORE = 0.995
+_SMALLEST_SHARE = 0.05
+_NEVER = -1e3  # logarithm of a weight that is none, finite so that differences are
+
+
+class BeliefSettings(BaseModel):
+    """Settings of the belief over time."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    motion: MotionSettings = MotionSettings()
+    likelihood: float = Field(6.0, gt=0.0, description="weight of log(1 / (1 - score))")
+    elsewhere: float = Field(
+        0.88, gt=0.0, lt=1.0, description="score with which the rest of the world competes"
+    )
+    see_through: float = Field(3.0, ge=0.0, description="weight of the rays that see through")
+    benefit: float = Field(0.5, description="log odds of a place whose view may be blocked")
+    blocked: float = Field(6.0, ge=0.0, description="weight of the readings that may be blocked")
+    blocked_through: float = Field(
+        20.0, ge=0.0, description="weight of the rays that see through, where some are blocked"
+    )
+    most_against: float = Field(6.0, gt=0.0, description="log odds that one scan can take")
+    most_for: float = Field(4.0, gt=0.0, description="log odds that one scan can give")
+    support: float = Field(
+        0.5, ge=0.0, le=1.0, description="share of the log odds that the latest scan has at once"
+    )
+    way_alike: float = Field(2.0, gt=0.0, description="way on which scans err together, metres")
+    turn_alike: float = Field(2.0, gt=0.0, description="the same of a turn on the spot, radians")
+    still: float = Field(0.01, ge=0.0, description="share of new evidence in a scan at rest")
+    carried_away: float = Field(
+        1e-4, gt=0.0, lt=1.0, description="probability of being carried away, per metre"
+    )
+    search_again: float = Field(
+        0.1, ge=0.0, description="share of 'nowhere' that is searched again, per metre"
+    )
+    reading_deviation: float = Field(
+        0.16, gt=0.0, description="of a reading, as many err together, metres"
+    )
+    found_deviation: float = Field(
+        0.3, gt=0.0, description="of the position of a place when it is found, metres"
+    )
+    found_turn: float = Field(0.15, gt=0.0, description="of its heading, radians")
+    same_distance: float = Field(0.3, gt=0.0, description="places nearer are one, metres")
+    same_turn: float = Field(0.15, gt=0.0, description="places turned less are one, radians")
+    reach: float = Field(
+        3.0, ge=0.0, description="deviations within which a place may have been mistaken"
+    )
+    mistaken: float = Field(0.1, ge=0.0, le=1.0, description="probability that it was")
+    places: int = Field(32, ge=1, description="most places that are kept")
+    smallest: float = Field(1e-6, ge=0.0, description="probability of a place worth keeping")
+    search_spacing: float = Field(
+        0.5, ge=0.0, description="way between searches of the whole map while lost, metres"
+    )
+    check_spacing: float = Field(2.0, ge=0.0, description="the same while located, metres")
+    threshold: float = Field(0.99, gt=0.0, lt=1.0, description="probability that is reported")
+
+
+@dataclass(frozen=True, eq=False)
+class Mixture:
+    """Places and their weights; logarithms of weights, summing to one with the support.
+
+    Args:
+        poses: (K, 3) T_set_laser, metres and radians.
+        covariances: (K, 3, 3) of x, y and theta, set's frame.
+        weights: (K,) collected along the way.
+        support: (K,) log odds of the latest scan.
+        unsearched: Of anywhere else.
+        nowhere: Of what was searched and not found.
+    """
+
+    poses: NDArray[np.float64]
+    covariances: NDArray[np.float64]
+    weights: NDArray[np.float64]
+    support: NDArray[np.float64]
+    unsearched: float = 0.0
+    nowhere: float = _NEVER
+
+    def __len__(self) -> int:
+        return len(self.weights)
+
+
+def nothing_known() -> Mixture:
+    """Return the belief of a robot that was just switched on."""
+    return Mixture(np.empty((0, 3)), np.empty((0, 3, 3)), np.empty(0), np.empty(0))
+
+
+def moved(mixture: Mixture, step: Motion, settings: BeliefSettings) -> Mixture:
+    """Move all places by a step of the robot and spread them by its uncertainty."""
+    way = step.driven + 0.5 * step.turned + 0.01
+    again = min(settings.search_again * way, 0.5)
+    away = min(settings.carried_away * way, 0.5)
+    total = _log_sum(mixture.weights + settings.support * mixture.support)
+    unsearched = _log_sum(
+        np.array([mixture.unsearched, mixture.nowhere + _log(again), total + _log(away)])
+    )
+    poses, covariances = _moved(
+        mixture.poses, mixture.covariances, step.step.to_array(), step.covariance
+    )
+    return replace(
+        mixture,
+        poses=poses,
+        covariances=covariances,
+        weights=mixture.weights + math.log1p(-away),
+        unsearched=unsearched,
+        nowhere=mixture.nowhere + math.log1p(-again),
+    )
+
+
+def admitted(
+    mixture: Mixture, poses: NDArray[np.float64], settings: BeliefSettings
+) -> tuple[Mixture, NDArray[np.int64]]:
+    """Take in the places that a search of the map found, where they are new.
+
+    A place within reach of one that was known may be that one, mistaken (along a corridor, or
+    after a step without odometry), and inherits from it.
+
+    Returns:
+        The mixture, new places last and without weight; (K,) index of the place that each
+        comes from: its own if it was known, -1 if it comes from what was unsearched.
+    """
+    same = (settings.same_distance, settings.same_turn)
+    new, parents = _new(
+        mixture.poses, mixture.covariances, mixture.weights, poses, same, settings.reach
+    )
+    count = len(new)
+    spread = np.diag(
+        np.square((settings.found_deviation, settings.found_deviation, settings.found_turn))
+    )
+    origin = np.concatenate([np.arange(len(mixture)), parents])
+    return replace(
+        mixture,
+        poses=np.concatenate([mixture.poses, poses[new]]),
+        covariances=np.concatenate([mixture.covariances, np.repeat(spread[None], count, axis=0)]),
+        weights=np.concatenate([mixture.weights, np.full(count, _NEVER)]),
+        support=np.concatenate([mixture.support, np.zeros(count)]),
+    ), origin
+
+
+def stiffness(mixture: Mixture, settings: BeliefSettings) -> NDArray[np.float64]:
+    """Return (K, 3, 3) how firmly each place holds its pose against the readings of a scan."""
+    held: NDArray[np.float64] = _inverses(mixture.covariances) * settings.reading_deviation**2
+    return held
+
+
+def log_odds(fits: Fits, settings: BeliefSettings) -> NDArray[np.float64]:
+    """Return (K,) u of the module's text for every place."""
+    score, close, free, unknown, through = fits.features[
+        :, [_SCORE, _CLOSE, _FREE, _UNKNOWN, _THROUGH]
+    ].T
+    least = math.log(1.0 - settings.elsewhere)
+    known = np.maximum(1.0 - unknown, _SMALLEST_SHARE)
+    rest = 1.0 - np.clip(score / known, 0.0, _LARGEST_SCORE)
+    plain = known * settings.likelihood * (least - np.log(rest)) - settings.see_through * through
+    shown = np.maximum(close, _SMALLEST_SHARE)
+    rest = 1.0 - np.clip((score + 0.5 * free) / shown, 0.0, _LARGEST_SCORE)
+    blocked = (
+        close * settings.likelihood * (least - np.log(rest))
+        - settings.blocked * np.maximum(1.0 - close - unknown, 0.0)
+        - settings.blocked_through * through
+    )
+    odds = np.maximum(plain, np.minimum(blocked, settings.benefit))
+    return np.asarray(np.clip(odds, -settings.most_against, settings.most_for))
+
+
+def weighed(
+    mixture: Mixture,
+    fits: Fits,
+    origin: NDArray[np.int64],
+    share: float,
+    settings: BeliefSettings,
+) -> Mixture:
+    """Weigh all places by how well a scan fits there.
+
+    Args:
+        mixture: The places as they were expected, those just found last.
+        fits: Of the scan at every place.
+        origin: (K,) where each comes from, as `admitted` says.
+        share: Of new evidence in this scan, in [0, 1].
+        settings: Of the belief.
+    """
+    odds = log_odds(fits, settings)
+    count = len(mixture)
+    weights = mixture.weights.copy()
+    known = origin == np.arange(count)
+    inherits = ~known & (origin >= 0)
+    weights[inherits] = weights[origin[inherits]] + _log(settings.mistaken)
+    weights[known | inherits] += share * odds[known | inherits]
+    unsearched, nowhere = mixture.unsearched, mixture.nowhere
+    found = origin < 0
+    if found.any():
+        total = _log_sum(np.append(odds[found], 0.0))
+        weights[found] = unsearched + (1.0 - settings.support) * odds[found] - total
+        nowhere = _log_sum(np.array([nowhere, unsearched - total]))
+        unsearched = _NEVER
+    new = np.where(known, min(4.0 * share, 1.0), 1.0)
+    information = fits.hessians * (new / settings.reading_deviation**2)[:, None, None]
+    covariances = _inverses(_inverses(mixture.covariances) + information)
+    return Mixture(fits.poses, covariances, weights, odds, unsearched, nowhere)
+
+
+def tidied(mixture: Mixture, settings: BeliefSettings) -> Mixture:
+    """Join places that have become one, drop the least likely, and let the weights sum to one."""
+    total = mixture.weights + settings.support * mixture.support
+    order = np.argsort(-total, kind="stable")
+    owner = _owners(mixture.poses[order], settings.same_distance, settings.same_turn)
+    weights = mixture.weights[order]
+    for k in np.flatnonzero(owner != np.arange(len(order))):
+        weights[owner[k]] = _log_sum(np.array([weights[owner[k]], weights[k]]))
+    kept = np.flatnonzero(owner == np.arange(len(order)))
+    order, weights = order[kept], weights[kept]
+    support = mixture.support[order]
+    total = weights + settings.support * support
+    one = _log_sum(np.append(total, [mixture.unsearched, mixture.nowhere]))
+    good = total - one >= _log(settings.smallest)
+    good[settings.places :] = False
+    lost = _log_sum(np.append(total[~good], mixture.nowhere))
+    return Mixture(
+        mixture.poses[order[good]],
+        mixture.covariances[order[good]],
+        weights[good] - one,
+        support[good],
+        max(mixture.unsearched - one, _NEVER),
+        max(lost - one, _NEVER),
+    )
+
+
+def probabilities(mixture: Mixture, settings: BeliefSettings) -> NDArray[np.float64]:
+    """Return (K,) that the robot is at each place; what is missing to one is elsewhere."""
+    total = mixture.weights + settings.support * mixture.support
+    one = _log_sum(np.append(total, [mixture.unsearched, mixture.nowhere]))
+    return np.asarray(np.exp(total - one))
+
+
+def _log(value: float) -> float:
+    return math.log(value) if value > 0.0 else _NEVER
+
+
+def _log_sum(values: NDArray[np.float64]) -> float:
+    """Logarithm of the sum of exponentials; ``_NEVER`` of none."""
+    if not len(values):
+        return _NEVER
+    largest = float(values.max())
+    return max(largest + math.log(float(np.exp(values - largest).sum())), _NEVER)
+
+
+@kernel
+def _moved(poses, covariances, step, noise):  # type: ignore[no-untyped-def]
+    """Chain every pose with a step and carry both covariances along."""
+    out = np.empty((len(poses), 3))
+    spread = np.empty((len(poses), 3, 3))
+    for k in range(len(poses)):
+        c, s = math.cos(poses[k, 2]), math.sin(poses[k, 2])
+        x, y = c * step[0] - s * step[1], s * step[0] + c * step[1]
+        out[k, 0] = poses[k, 0] + x
+        out[k, 1] = poses[k, 1] + y
+        out[k, 2] = wrapped(poses[k, 2] + step[2])
+        before = covariances[k]
+        a = before[0, 0] - y * before[0, 2] - y * (before[0, 2] - y * before[2, 2])
+        b = before[0, 1] + x * before[0, 2] - y * (before[1, 2] + x * before[2, 2])
+        d = before[1, 1] + x * before[1, 2] + x * (before[1, 2] + x * before[2, 2])
+        e, f = before[0, 2] - y * before[2, 2], before[1, 2] + x * before[2, 2]
+        # The noise turns with the laser.
+        p, q, r = noise[0, 0], noise[0, 1], noise[1, 1]
+        u, v = noise[0, 2], noise[1, 2]
+        spread[k, 0, 0] = a + c * c * p - 2.0 * c * s * q + s * s * r
+        spread[k, 1, 1] = d + s * s * p + 2.0 * c * s * q + c * c * r
+        spread[k, 0, 1] = spread[k, 1, 0] = b + c * s * (p - r) + (c * c - s * s) * q
+        spread[k, 0, 2] = spread[k, 2, 0] = e + c * u - s * v
+        spread[k, 1, 2] = spread[k, 2, 1] = f + s * u + c * v
+        spread[k, 2, 2] = before[2, 2] + noise[2, 2]
+    return out, spread
+
+
+@kernel
+def _inverses(matrices):  # type: ignore[no-untyped-def]
+    """Inverse of every symmetric (3, 3) matrix, symmetric by construction."""
+    out = np.empty(matrices.shape)
+    for k in range(len(matrices)):
+        h = matrices[k]
+        a, b, c, d, e, f = h[0, 0], h[0, 1], h[0, 2], h[1, 1], h[1, 2], h[2, 2]
+        p, q, r = d * f - e * e, c * e - b * f, b * e - c * d
+        s, t, u = a * f - c * c, b * c - a * e, a * d - b * b
+        determinant = a * p + b * q + c * r
+        out[k, 0, 0], out[k, 1, 1], out[k, 2, 2] = p, s, u
+        out[k, 0, 1] = out[k, 1, 0] = q
+        out[k, 0, 2] = out[k, 2, 0] = r
+        out[k, 1, 2] = out[k, 2, 1] = t
+        out[k] /= determinant
+    return out
+
+
+@kernel
+def _is_same(a, b, same):  # type: ignore[no-untyped-def]
+    """Whether two poses are one place."""
+    return math.hypot(a[0] - b[0], a[1] - b[1]) < same[0] and abs(wrapped(a[2] - b[2])) < same[1]
+
+
+@kernel
+def _owners(poses, distance, turn):  # type: ignore[no-untyped-def]
+    """Index of the first place that each is one with, which is its own if there is none."""
+    owner = np.arange(len(poses))
+    for k in range(len(poses)):
+        for j in range(k):
+            if owner[j] == j and _is_same(poses[k], poses[j], (distance, turn)):
+                owner[k] = j
+                break
+    return owner
+
+
+@kernel
+def _new(known, covariances, weights, found, same, reach):  # type: ignore[no-untyped-def]
+    """Which found poses are new, and the heaviest place within reach of each, or -1."""
+    information = _inverses(covariances)
+    new = np.empty(len(found), np.int64)
+    parents = np.empty(len(found), np.int64)
+    count = 0
+    for n in range(len(found)):
+        is_new, parent, best = True, -1, -np.inf
+        for k in range(len(known)):
+            if _is_same(found[n], known[k], same):
+                is_new = False
+                break
+            x, y = found[n, 0] - known[k, 0], found[n, 1] - known[k, 1]
+            t = wrapped(found[n, 2] - known[k, 2])
+            i = information[k]
+            off = x * x * i[0, 0] + y * y * i[1, 1] + t * t * i[2, 2]
+            off += 2.0 * (x * y * i[0, 1] + x * t * i[0, 2] + y * t * i[1, 2])
+            if off < reach * reach and weights[k] > best:
+                parent, best = k, weights[k]
+        if is_new:
+            new[count] = n
+            parents[count] = parent
+            count += 1
+    return new[:count], parents[:count]

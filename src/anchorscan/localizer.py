@@ -1,0 +1,208 @@
+"""Finding a lost robot on the move: scans and odometry in, a belief out, one scan at a time.
+
+The paper recommends its hypotheses for probabilistic localization with the ability to recover
+from arbitrary errors.  The localizer starts without any prior: hypotheses of the whole map become
+places of a mixture, odometry moves them, every scan weighs and refines them, and the map is
+searched again every now and then, so that a robot which was carried away is found again.
+
+Every step costs a bounded number of look-ups and at most one search; memory is bounded; nothing
+is random and nothing runs beside.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .belief import (
+    Mixture,
+    admitted,
+    moved,
+    nothing_known,
+    probabilities,
+    stiffness,
+    tidied,
+    weighed,
+)
+from .decision import held
+from .hypothesis import Hypothesis
+from .matcher import Candidates, Trace
+from .motion import Motion, motion
+from .pose import Pose2D
+from .scan import LaserScan
+from .settings import Settings
+from .verification import Fits
+
+__all__ = ["Belief", "Localizer"]
+
+# How many places a belief names, and how much likelier than the next the best must be.
+_NAMED = 5
+_ALIKE = 0.3
+
+
+class Places(Protocol):
+    """What a localizer asks of a map: a `Matcher` or a `ReferenceSet`."""
+
+    @property
+    def settings(self) -> Settings: ...
+    def explain(self, scan: LaserScan, candidates: Candidates = None) -> Trace: ...
+    def follow(
+        self, scan: LaserScan, poses: NDArray[np.float64], stiffness: NDArray[np.float64]
+    ) -> Fits: ...
+    def nearest(
+        self, poses: NDArray[np.float64]
+    ) -> tuple[NDArray[np.int64], NDArray[np.float64]]: ...
+
+
+@dataclass(frozen=True, eq=False)
+class Belief:
+    """Where the robot is believed to be after a scan.
+
+    Args:
+        hypotheses: The likeliest places of the laser, best first; their ``evaluation`` and
+            ``quality`` are NaN, their ``score`` is the log odds that the latest scan gave.
+        elsewhere: Probability that it is at none of all places.
+        accepted: Whether the best is to be acted on.
+    """
+
+    hypotheses: tuple[Hypothesis, ...]
+    elsewhere: float
+    accepted: bool
+
+    @property
+    def pose(self) -> Pose2D | None:
+        """``T_set_laser``, the best guess; None without any."""
+        return self.hypotheses[0].pose if self.hypotheses else None
+
+    @property
+    def covariance(self) -> NDArray[np.float64] | None:
+        """(3, 3) of its x, y (metres) and theta (radians), set's frame."""
+        return self.hypotheses[0].covariance if self.hypotheses else None
+
+    @property
+    def probability(self) -> float:
+        """That the best guess is within 0.5 m and 10 degrees of the truth."""
+        return self.hypotheses[0].probability if self.hypotheses else 0.0
+
+    @property
+    def state(self) -> Literal["located", "ambiguous", "lost"]:
+        """Whether the robot is located, at one of several places alike, or anywhere."""
+        if self.accepted:
+            return "located"
+        first, second = (*(each.probability for each in self.hypotheses[:2]), 0.0, 0.0)[:2]
+        both = first + second
+        return "ambiguous" if second >= _ALIKE * first and both > self.elsewhere else "lost"
+
+
+class Localizer:
+    """Keeps a belief over time in a set whose references have poses.
+
+    Args:
+        places: A reference set or a matcher; references may come and go meanwhile.
+    """
+
+    def __init__(self, places: Places) -> None:
+        self._places = places
+        self._settings = places.settings.belief
+        self.reset()
+
+    def reset(self) -> None:
+        """Know nothing."""
+        self._mixture = nothing_known()
+        self._odometry: Pose2D | None = None
+        self._stamp: float | None = None
+        self._since_search = math.inf
+        self._belief = Belief((), 1.0, False)
+
+    @property
+    def mixture(self) -> Mixture:
+        """All places and their weights."""
+        return self._mixture
+
+    def update(
+        self, scan: LaserScan, odometry: Pose2D | None = None, stamp: float | None = None
+    ) -> Belief:
+        """Take the next scan.
+
+        Args:
+            scan: In the frame of the laser.
+            odometry: ``T_odom_laser`` when it was taken, where known.
+            stamp: Seconds on any clock, where known; needed only where odometry is not.
+
+        Returns:
+            What is believed now.
+        """
+        settings = self._settings
+        step = self._step(odometry, stamp)
+        if not scan.is_return.any():
+            self._mixture = moved(self._mixture, step, settings)
+            return self._report()
+        expected = moved(self._mixture, step, settings)
+        mixture, origin = expected, np.arange(len(expected))
+        if self._is_due(step):
+            mixture, origin = admitted(expected, self._search(scan), settings)
+        if len(mixture):
+            fits = self._places.follow(scan, mixture.poses, stiffness(mixture, settings))
+            share = self._share(step, expected, fits)
+            mixture = tidied(weighed(mixture, fits, origin, share, settings), settings)
+        self._mixture = mixture
+        return self._report()
+
+    def _step(self, odometry: Pose2D | None, stamp: float | None) -> Motion:
+        elapsed = None if stamp is None or self._stamp is None else stamp - self._stamp
+        step = motion(self._odometry, odometry, elapsed, self._settings.motion)
+        self._odometry = odometry if odometry is None or odometry.is_finite() else None
+        self._stamp = stamp if stamp is None or math.isfinite(stamp) else None
+        return step
+
+    def _is_due(self, step: Motion) -> bool:
+        """Whether the whole map is to be searched for this scan."""
+        settings = self._settings
+        spacing = settings.check_spacing if self._belief.accepted else settings.search_spacing
+        self._since_search += step.driven + 0.5 * step.turned
+        due = self._since_search >= spacing or not len(self._mixture)
+        if due:
+            self._since_search = 0.0
+        return due
+
+    def _search(self, scan: LaserScan) -> NDArray[np.float64]:
+        in_map = self._places.explain(scan).in_map
+        return np.empty((0, 3)) if in_map is None else in_map.fits.poses
+
+    def _share(self, step: Motion, expected: Mixture, fits: Fits) -> float:
+        """How much of a scan's evidence is new; by the motion seen, where none was measured."""
+        settings = self._settings
+        driven, turned = step.driven, step.turned
+        if not step.measured and len(expected):
+            before, now = Pose2D(*expected.poses[0].tolist()), Pose2D(*fits.poses[0].tolist())
+            driven, turned = min(driven, before.distance(now)), min(turned, before.turn(now))
+        return min(driven / settings.way_alike + turned / settings.turn_alike + settings.still, 1.0)
+
+    def _report(self) -> Belief:
+        """Name the likeliest places."""
+        mixture, settings = self._mixture, self._settings
+        worth = probabilities(mixture, settings)
+        order = np.argsort(-worth, kind="stable")[:_NAMED]
+        references, T_reference_laser = self._places.nearest(mixture.poses[order])
+        within = [held(mixture.covariances[k]) for k in order]
+        accepted = bool(len(order)) and worth[order[0]] * within[0] >= settings.threshold
+        hypotheses = tuple(
+            Hypothesis(
+                reference=int(references[n]),
+                pose_in_reference=Pose2D(*T_reference_laser[n].tolist()),
+                pose=Pose2D(*mixture.poses[k].tolist()),
+                covariance=mixture.covariances[k],
+                evaluation=math.nan,
+                quality=math.nan,
+                score=float(mixture.support[k]),
+                probability=float(worth[k] * within[n]),
+                accepted=accepted and n == 0,
+            )
+            for n, k in enumerate(order)
+        )
+        self._belief = Belief(hypotheses, max(1.0 - float(worth.sum()), 0.0), accepted)
+        return self._belief
