@@ -7,10 +7,10 @@ space), and whether it is a surface itself.  A reading of a new scan that ends o
 speaks for a pose, one that ends in known free space against it, one that ends where nobody
 looked says nothing; a ray that passes through a known surface speaks against it, too.
 
-The map is kept in tiles of 64 x 64 cells, which exist only where a ray went.  A tile holds
-the evidence as integers (hits, their mean position, passes), so that adding and removing a
-reference are exact opposites and the order of references is irrelevant, and one byte a cell
-derived from it:
+The map is kept in tiles of 64 x 64 cells, which exist only where a ray told something: on its
+way, and within ``reach`` of its end.  A tile holds the evidence as integers (hits, their mean
+position, passes), so that adding and removing a reference are exact opposites and the order of
+references is irrelevant, and one byte a cell derived from it:
 
     bits 0-5   distance to the nearest surface in 63rds of ``reach``; 63 is farther
     bit 6      rays passed here: known free space
@@ -32,6 +32,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
 from ._jit import kernel
+from .errors import AnchorscanError
 from .pose import Pose2D
 from .scan import LaserScan
 
@@ -43,6 +44,8 @@ _FAR = 63  # distance code of "farther than reach"
 _FREE, _SURFACE = 64, 128
 # Farther than this from all surfaces, metres, a ray is clear of them.
 _CLEAR = 0.2
+# A table of so many squares, a quarter of a gigabyte, is for a city.
+_MOST_SQUARES = 1 << 26
 # Hit positions are summed in 256ths of a cell, so that sums stay integers.
 _FRACTIONS = 256
 _1, _4, _6, _8, _12, _15, _63, _64 = (np.uint64(value) for value in (1, 4, 6, 8, 12, 15, 63, 64))
@@ -137,12 +140,17 @@ class LikelihoodField:
         self._evidence = _no_evidence(1)
         self._codes = np.full((1, _SIDE, _SIDE), _FAR, np.uint8)
         self._coarse = np.zeros((1, _SIDE // _COARSE, _SIDE // _COARSE), np.int8)
+        _pool(np.zeros(1, np.int32), self._codes, self._coarse, settings.weights())
         self._used = 1
+        self._tiles = self._snapshot()
         self._change(self._rays(scans), 1)
 
     @property
     def tiles(self) -> Tiles:
-        """The map as kernels read it; a snapshot as long as nobody adds or removes."""
+        """The map as kernels read it; it stays as it is when others add and remove."""
+        return self._tiles
+
+    def _snapshot(self) -> Tiles:
         row, column = self._corner
         return Tiles(
             self._table.reshape(-1),
@@ -180,21 +188,31 @@ class LikelihoodField:
         touched = np.zeros(self._table.shape, np.bool_)
         row, column = self._corner
         frame = (column * _SIDE, row * _SIDE, self._settings.resolution, self._settings.margin)
-        _touch(rays.origins, rays.ends, touched, frame)
+        _touch(rays.origins, rays.ends, touched, frame, self._halo)
         self._allocate(touched)
         _deposit(rays.origins, rays.ends, self._table, self._evidence, frame, sign)
         self._derive(touched)
+        self._tiles = self._snapshot()
+
+    @property
+    def _halo(self) -> int:
+        """Cells within ``reach``."""
+        return math.ceil(self._settings.reach / self._settings.resolution)
 
     def _cover(self, rays: _Rays) -> None:
-        """Widen the table to all rays and a tile around them."""
-        width = _SIDE * self._settings.resolution
-        both = np.concatenate([rays.origins, rays.ends])
-        low = np.floor(both.min(axis=0) / width).astype(int) - 1
-        high = np.floor(both.max(axis=0) / width).astype(int) + 2
+        """Widen the table to all that rays tell of and a tile around it."""
+        cells = np.concatenate([rays.origins, rays.ends]) / self._settings.resolution
+        if not np.isfinite(cells).all():
+            raise AnchorscanError("a reference has a pose that is not finite")
+        low = np.floor((cells.min(axis=0) - self._halo) / _SIDE).astype(int) - 1
+        high = np.floor((cells.max(axis=0) + self._halo) / _SIDE).astype(int) + 2
         row, column = self._corner
         if self._used > 1:
             low = np.minimum(low, (column, row))
             high = np.maximum(high, (column + self._table.shape[1], row + self._table.shape[0]))
+        if float(high[0] - low[0]) * float(high[1] - low[1]) > _MOST_SQUARES:
+            apart = float((high - low).max()) * _SIDE * self._settings.resolution
+            raise AnchorscanError(f"references lie {apart / 1e3:.0f} km apart; is a pose wrong?")
         table = np.zeros((high[1] - low[1], high[0] - low[0]), np.int32)
         if self._used > 1:
             if table.shape == self._table.shape:
@@ -218,20 +236,17 @@ class LikelihoodField:
             room = need if self._used == 1 else max(need, 2 * len(self._codes))
             self._evidence = _Evidence(*(_grown(layer, room, 0) for layer in self._evidence))
             self._codes = _grown(self._codes, room, _FAR)
-            self._coarse = _grown(self._coarse, room, 0)
+            self._coarse = _grown(self._coarse, room, int(self._coarse[0, 0, 0]))
         self._table, self._used = table, need
 
     def _derive(self, touched: NDArray[np.bool_]) -> None:
-        """Bring the bytes of the touched tiles and of their neighbours up to date."""
-        near = np.zeros_like(touched)
-        for down in (-1, 0, 1):
-            for left in (-1, 0, 1):
-                near |= np.roll(touched, (down, left), (0, 1))
-        rows, columns = np.nonzero(near & (self._table > 0))
+        """Bring the bytes of the touched tiles up to date."""
+        rows, columns = np.nonzero(touched)
         settings = self._settings
         limits = (
             settings.resolution,
             settings.reach,
+            self._halo,
             settings.fewest_passes,
             settings.passes_per_hit,
         )
@@ -262,8 +277,8 @@ def _steps(ox, oy, ex, ey, resolution, margin):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _touch(origins, ends, touched, frame):  # type: ignore[no-untyped-def]
-    """Mark the tiles that rays pass or end in."""
+def _touch(origins, ends, touched, frame, halo):  # type: ignore[no-untyped-def]
+    """Mark the tiles that rays pass, and those within ``halo`` cells of their ends."""
     column, row, resolution, margin = frame
     for i in range(len(ends)):
         ox, oy, ex, ey = origins[i, 0], origins[i, 1], ends[i, 0], ends[i, 1]
@@ -274,7 +289,9 @@ def _touch(origins, ends, touched, frame):  # type: ignore[no-untyped-def]
             touched[cy // _SIDE, cx // _SIDE] = True
         cx = int(math.floor(ex / resolution)) - column
         cy = int(math.floor(ey / resolution)) - row
-        touched[cy // _SIDE, cx // _SIDE] = True
+        for r in range((cy - halo) // _SIDE, (cy + halo) // _SIDE + 1):
+            for c in range((cx - halo) // _SIDE, (cx + halo) // _SIDE + 1):
+                touched[r, c] = True
 
 
 @kernel
@@ -304,8 +321,7 @@ def _deposit(origins, ends, table, evidence, frame, sign):  # type: ignore[no-un
 @kernel
 def _derive(rows, columns, table, evidence, codes, limits):  # type: ignore[no-untyped-def]
     """Distances, free space and surfaces of the tiles at ``rows`` and ``columns``."""
-    resolution, reach, fewest_passes, passes_per_hit = limits
-    halo = int(math.ceil(reach / resolution))
+    resolution, reach, halo, fewest_passes, passes_per_hit = limits
     distance = np.empty((_SIDE, _SIDE), np.float32)
     for n in range(len(rows)):
         tile = table[rows[n], columns[n]]

@@ -1,0 +1,478 @@
+"""The stitched map against a plain twin, cell by cell, and what may not change it."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections import Counter, defaultdict
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scans import EXACT, WIDE, box, building, drawn, places, seeds, sweeps
+
+from anchorscan import AnchorscanError, LaserScan, Pose2D, SensorModel, Settings, simulate
+from anchorscan.field import (
+    FieldSettings,
+    LikelihoodField,
+    cell_code,
+    coarse_score,
+    field_scores,
+    normal_equations,
+    passed_through,
+    refined,
+)
+from anchorscan.field import _solved as solved
+
+FAR, FREE, SURFACE = 63, 64, 128
+DEFAULT = Settings.preset("default").field
+# Cells of a decimetre: a room is a tile or two, and the twin keeps up.
+COARSE = FieldSettings(resolution=0.1, reach=0.5, sharpness=0.4)
+SPARSE = SensorModel(field_of_view=2.0 * math.pi, resolution=math.radians(6.0))
+# A map far from the origin is as good as any.
+poses = st.builds(Pose2D, st.floats(-30, 30), st.floats(-30, 30), st.floats(-3.1, 3.1))
+
+
+# The twin: a dictionary of cells.
+
+
+class PlainMap:
+    """Every hit and every pass by itself."""
+
+    def __init__(self, limits, scans=()):
+        self.limits = limits
+        self.hits = defaultdict(list)
+        self.passes = Counter()
+        self.told = set()
+        for scan, pose in scans:
+            self.add(scan, pose)
+
+    def add(self, scan, pose):
+        limits, size = self.limits, self.limits.resolution
+        for point in scan.points:
+            length = math.hypot(*point)
+            if length > limits.farthest:
+                continue
+            end = pose.apply(point[np.newaxis])[0]
+            before = None
+            for k in range(math.floor((length - limits.margin) / size)):
+                x = pose.x + k * size * (end[0] - pose.x) / length
+                y = pose.y + k * size * (end[1] - pose.y) / length
+                cell = math.floor(x / size), math.floor(y / size)
+                self.passes[cell] += cell != before
+                before = cell
+            cell = math.floor(end[0] / size), math.floor(end[1] / size)
+            within = [math.floor((end[n] / size - cell[n]) * 256) for n in range(2)]
+            self.hits[cell].append(within)
+
+    def code(self, cx, cy):
+        """The byte of a cell, as the module's text says."""
+        limits = self.limits
+        near = math.ceil(limits.reach / limits.resolution)
+        distance = limits.reach
+        for u, v in itertools.product(
+            range(cx - near, cx + near + 1), range(cy - near, cy + near + 1)
+        ):
+            if (u, v) in self.hits:
+                mean = np.mean(self.hits[u, v], axis=0) / 256 + 0.5 / 256
+                off = math.dist((u + mean[0], v + mean[1]), (cx + 0.5, cy + 0.5))
+                distance = min(distance, off * limits.resolution)
+        code = int(distance / limits.reach * FAR)
+        hits, passes = len(self.hits.get((cx, cy), ())), self.passes[cx, cy]
+        code += FREE * (passes >= limits.fewest_passes)
+        return code + SURFACE * (hits > 0 and passes <= limits.passes_per_hit * hits)
+
+
+def code_at(tiles, cx, cy):
+    """The byte of a cell, counted from the origin of the set's frame."""
+    return int(cell_code(tiles, cx - tiles.column, cy - tiles.row))
+
+
+def same_codes(ours, theirs):
+    """Hold bytes equal; distances are truncated, so that rounding may move them by one."""
+    ours, theirs = np.array(ours), np.array(theirs)
+    np.testing.assert_array_equal(ours & ~FAR, theirs & ~FAR)
+    off = np.abs((ours & FAR) - (theirs & FAR))
+    assert off.max(initial=0) <= 1
+    assert np.count_nonzero(off) <= 1 + 0.002 * len(off)
+
+
+def check_against_twin(limits, scans, cells):
+    tiles = LikelihoodField(limits, scans).tiles
+    plain = PlainMap(limits, scans)
+    same_codes([code_at(tiles, *cell) for cell in cells], [plain.code(*cell) for cell in cells])
+
+
+def cells_around(scans, limits, count, seed=0):
+    """Cells on the way, at the ends and beyond the rays of scans, and some where none went."""
+    rng = np.random.default_rng(seed)
+    ends = np.concatenate([pose.apply(scan.points) for scan, pose in scans])
+    eyes = np.concatenate([np.full((len(scan.points), 2), (p.x, p.y)) for scan, p in scans])
+    chosen = rng.integers(len(ends), size=count)
+    share = rng.choice([0.3, 0.8, 1.0, 1.0, 1.1], (count, 1))
+    at = eyes[chosen] + share * (ends[chosen] - eyes[chosen]) + rng.normal(0.0, 0.15, (count, 2))
+    at[: count // 10] += 40.0
+    return sorted({(int(cx), int(cy)) for cx, cy in np.floor(at / limits.resolution).tolist()})
+
+
+@pytest.mark.interpreted
+def test_a_small_room_is_the_twins_in_every_cell():
+    limits = FieldSettings(resolution=0.25, reach=0.6, sharpness=0.5)
+    scans = [
+        (drawn(box(-2.0, -1.0, 2.0, 1.0), at=Pose2D(x, 0.1, h), sensor=SPARSE), Pose2D(x, 0.1, h))
+        for x, h in ((-1.0, 0.0), (0.6, 2.0))
+    ]
+    check_against_twin(limits, scans, list(itertools.product(range(-13, 13), range(-9, 9))))
+
+
+@given(seeds, poses, st.sampled_from([COARSE, DEFAULT]))
+@settings(max_examples=25)
+def test_bytes_are_the_twins(seed, motion, limits):
+    world, at = building(seed % 4)
+    rng = np.random.default_rng(seed)
+    scans = [
+        (simulate(world, place, SPARSE, rng), motion @ place)
+        for place in (at[k] for k in rng.integers(len(at), size=3))
+    ]
+    check_against_twin(limits, scans, cells_around(scans, limits, 150, seed))
+
+
+def test_real_scans_give_the_bytes_of_the_twin(real_records):
+    records = [r for r in real_records("freiburg-101.log.gz") if r.scan is not None][:40:10]
+    scans = [(record.scan, record.pose) for record in records]
+    check_against_twin(DEFAULT, scans, cells_around(scans, DEFAULT, 400))
+
+
+# What is seen of it.
+
+
+@pytest.fixture(scope="module")
+def room():
+    """Some exact scans of a room with a wall in it, and the map of them."""
+    walls = [*box(-4.0, -3.0, 5.0, 3.5), (0.5, -3.0, 0.5, 0.5), *box(2.5, 1.0, 3.3, 2.0)]
+    at = [Pose2D(-2.0, 0.5, 0.3), Pose2D(2.0, -1.0, 2.0), Pose2D(-1.0, 2.0, -1.0), Pose2D(4.2, 2.5)]
+    scans = [(drawn(walls, at=pose), pose) for pose in at]
+    return scans, LikelihoodField(DEFAULT, scans)
+
+
+def plain_scores(tiles, points, at, weights):
+    total = 0.0
+    for x, y in Pose2D(*at).apply(points).tolist():
+        total += weights[
+            code_at(tiles, math.floor(x / tiles.resolution), math.floor(y / tiles.resolution))
+        ]
+    return total / len(points)
+
+
+@given(seeds)
+@settings(max_examples=30)
+def test_scores_are_the_twins(room, seed):
+    rng = np.random.default_rng(seed)
+    tiles, weights = room[1].tiles, DEFAULT.weights()
+    at = rng.uniform((-8.0, -8.0, -4.0), (8.0, 8.0, 4.0), (3, 3))
+    points = rng.uniform(-6.0, 6.0, (20, 2))
+    expected = [plain_scores(tiles, points, each, weights) for each in at.tolist()]
+    np.testing.assert_allclose(field_scores(at, points, tiles, weights), expected, atol=1e-6)
+    assert field_scores(at, np.empty((0, 2)), tiles, weights).tolist() == [0.0] * 3
+
+
+@pytest.mark.interpreted
+def test_a_coarse_cell_has_the_best_score_of_its_cells():
+    walls = box(-1.0, -0.7, 1.0, 0.7)
+    scan = drawn(walls, sensor=SPARSE)
+    limits = FieldSettings(resolution=0.2, reach=0.5)
+    tiles = LikelihoodField(limits, [(scan, Pose2D(0.3, 0.2))]).tiles
+    weights = limits.weights()
+    for row in range(16 * tiles.height):
+        for column in range(16 * tiles.width):
+            best = max(
+                weights[cell_code(tiles, 4 * column + a, 4 * row + b)]
+                for a in range(4)
+                for b in range(4)
+            )
+            assert coarse_score(tiles, column, row) == round(127.0 * max(float(best), -1.0))
+
+
+def test_beyond_the_table_nothing_is_known(room):
+    tiles = room[1].tiles
+    right, top = 64 * tiles.width, 64 * tiles.height
+    for cx, cy in ((-1, 5), (5, -1), (right, 5), (5, top), (-(10**9), 10**9), (10**12, 0)):
+        assert cell_code(tiles, cx, cy) == FAR
+        assert coarse_score(tiles, cx // 4, cy // 4) == round(127.0 * DEFAULT.unknown_score)
+    nothing = LikelihoodField(DEFAULT).tiles
+    assert cell_code(nothing, 0, 0) == cell_code(nothing, 3, -7) == FAR
+
+
+def test_weights_fall_with_the_distance_and_more_so_in_free_space():
+    for limits in (DEFAULT, COARSE, FieldSettings(), FieldSettings(sharpness=0.2)):
+        weights = limits.weights()
+        assert weights.shape == (256,)
+        unknown, free = weights[: FAR + 1], weights[FREE : FREE + FAR + 1]
+        assert unknown[0] == free[0] == 1.0
+        assert np.all(np.diff(unknown) <= 0.0)
+        assert np.all(np.diff(free) <= 0.0)
+        assert np.all(free <= unknown)
+        assert unknown[FAR] == pytest.approx(limits.unknown_score)
+        assert free[FAR] == pytest.approx(-limits.free_penalty)
+        # Whether the cell itself is a surface makes no difference to who ends near one.
+        np.testing.assert_array_equal(weights[SURFACE:], weights[:SURFACE])
+
+
+# Gauss-Newton on it.
+
+
+def plain_distance(tiles, x, y):
+    """Distance to the nearest surface, between the centres of four cells."""
+    u, v = x / tiles.resolution - 0.5, y / tiles.resolution - 0.5
+    left, low = math.floor(u), math.floor(v)
+    total = 0.0
+    for cx, cy in itertools.product((left, left + 1), (low, low + 1)):
+        share = (1.0 - abs(u - cx)) * (1.0 - abs(v - cy))
+        total += share * (code_at(tiles, cx, cy) & FAR) / FAR * tiles.reach
+    return total
+
+
+def plain_normal_equations(at, points, tiles, scale):
+    hessian, gradient, squares, total = np.zeros((3, 3)), np.zeros(3), 0.0, 0.0
+    for point in points:
+
+        def distance(pose, point=point):
+            return plain_distance(tiles, *Pose2D(*pose).apply(point[np.newaxis])[0])
+
+        here = distance(at)
+        if here >= 0.9 * tiles.reach:
+            continue
+        slope = np.array([(distance(at + e) - distance(at - e)) / 2e-6 for e in 1e-6 * np.eye(3)])
+        weight = (1.0 + (here / scale) ** 2) ** -2
+        hessian += weight * np.outer(slope, slope)
+        gradient += weight * here * slope
+        squares += weight * here**2
+        total += weight
+    return hessian, gradient, squares, total
+
+
+@given(seeds)
+@settings(max_examples=15)
+def test_normal_equations_are_those_of_the_slopes(room, seed):
+    rng = np.random.default_rng(seed)
+    (scan, pose), *_ = room[0]
+    points = scan.points[rng.integers(len(scan.points), size=12)]
+    at = pose.to_array() + rng.normal(0.0, (0.1, 0.1, 0.03))
+    ours = normal_equations(at, points, room[1].tiles, 0.1)
+    theirs = plain_normal_equations(at, points, room[1].tiles, 0.1)
+    for a, b in zip(ours, theirs, strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-5, rtol=1e-5)
+
+
+@given(seeds)
+def test_the_damped_system_is_solved(seed):
+    rng = np.random.default_rng(seed)
+    slopes = rng.normal(0.0, 3.0, (int(rng.integers(0, 5)), 3))
+    hessian, gradient = slopes.T @ slopes, rng.normal(0.0, 1.0, 3)
+    expected = np.linalg.solve(hessian + 0.7 * np.eye(3), gradient)
+    np.testing.assert_allclose(solved(hessian, gradient, 0.7), expected, rtol=1e-9, atol=1e-9)
+
+
+def test_the_truth_is_a_fixed_point_of_the_refinement(room):
+    scans, field = room
+    for scan, pose in scans:
+        points = scan.points[::10]
+        moved = Pose2D(*refined(pose.to_array(), points, field.tiles, 12))
+        assert moved.distance(pose) < 0.02
+        assert moved.turn(pose) < math.radians(0.5)
+
+
+@given(seeds)
+@settings(max_examples=40)
+def test_a_pose_nearby_is_drawn_to_the_truth(room, seed):
+    rng = np.random.default_rng(seed)
+    scans, field = room
+    scan, pose = scans[seed % len(scans)]
+    start = pose @ Pose2D(*rng.uniform(-0.12, 0.12, 2), rng.uniform(-0.05, 0.05))
+    moved = Pose2D(*refined(start.to_array(), scan.points[::10], field.tiles, 12))
+    assert moved.distance(pose) < 0.03
+    assert moved.turn(pose) < math.radians(0.7)
+
+
+def test_where_nothing_is_near_nothing_moves(room):
+    far = np.array([200.0, -100.0, 0.5])
+    np.testing.assert_array_equal(refined(far, room[0][0][0].points, room[1].tiles, 8), far)
+    np.testing.assert_array_equal(refined(far, np.empty((0, 2)), room[1].tiles, 8), far)
+
+
+# Rays through surfaces.
+
+
+@pytest.fixture(scope="module")
+def wall():
+    """The map of a wall along y = 2, seen from both sides."""
+    line = [(-6.0, 2.0, 6.0, 2.0)]
+    at = [Pose2D(x, y, 0.2) for x in (-2.0, 0.0, 2.0) for y in (0.0, 4.0)]
+    return LikelihoodField(DEFAULT, [(drawn(line, at=pose), pose) for pose in at]).tiles
+
+
+def ray(tiles, begin, end, margin=0.3):
+    """Whether one ray counts as passing through."""
+    pose = np.array([*begin, 0.7])
+    point = Pose2D(*pose).inverse().apply(np.array([end]))
+    return passed_through(pose, point, tiles, margin)
+
+
+@pytest.mark.parametrize(
+    ("begin", "end", "through"),
+    [
+        ((0.0, 0.5), (0.0, 3.5), True),  # straight through
+        ((0.0, 3.5), (0.3, 0.5), True),  # from behind
+        ((-1.0, 1.0), (1.0, 3.0), True),  # slanted
+        ((0.0, 0.5), (0.0, 2.0), False),  # it ends on the wall
+        ((0.0, 0.5), (0.0, 2.2), False),  # it ends hardly behind it
+        ((0.0, 0.5), (0.0, 1.5), False),  # it ends before it
+        ((-4.0, 1.97), (4.0, 2.0), False),  # it grazes the wall
+        ((-4.0, 2.05), (4.0, 1.95), False),
+        ((-5.0, 1.6), (5.0, 2.4), False),  # so flat that it is hard to say
+        ((0.0, 4.5), (0.0, 9.0), False),  # nothing is there
+        ((30.0, 0.5), (30.0, 3.5), False),
+    ],
+)
+def test_a_ray_passes_through_a_surface_or_not(wall, begin, end, through):
+    assert ray(wall, begin, end) == through
+
+
+def test_the_share_of_rays_that_pass_through(wall):
+    pose = np.array([0.0, 0.5, 0.0])
+    ends = np.array([(0.0, 3.0), (0.5, 3.5), (0.0, 1.0), (1.0, 0.5)]) - pose[:2]
+    assert passed_through(pose, ends, wall, 0.3) == 0.5
+    assert passed_through(pose, np.empty((0, 2)), wall, 0.3) == 0.0
+
+
+def test_a_scan_sees_through_nothing_where_it_was_taken(room):
+    scans, field = room
+    for scan, pose in scans:
+        share = passed_through(pose.to_array(), scan.points, field.tiles, 0.3)
+        assert share < 0.03  # the end of a wall is as thick as a cell
+
+
+# What may not change it.
+
+
+def all_bytes(field):
+    """Every byte that differs from unknown, by the tile's place; and every piece of evidence."""
+    tiles = field.tiles
+
+    def bytes_of(tile):
+        layers = tiles.codes.reshape(-1, 4096), tiles.coarse.reshape(-1, 256), *field._evidence
+        return b"".join(layer[tile].tobytes() for layer in layers)
+
+    found = {}
+    for at in np.flatnonzero(tiles.table).tolist():
+        place = tiles.row + 64 * (at // tiles.width), tiles.column + 64 * (at % tiles.width)
+        found[place] = bytes_of(tiles.table[at])
+    return {place: each for place, each in found.items() if each != bytes_of(0)}
+
+
+def placed(count, seed, motion=Pose2D()):  # noqa: B008
+    world, at = building(seed % 4)
+    rng = np.random.default_rng(seed)
+    return [
+        (simulate(world, at[k], SPARSE, rng), motion @ at[k])
+        for k in rng.choice(len(at), count, replace=False)
+    ]
+
+
+@given(seeds, st.permutations(range(5)))
+@settings(max_examples=15)
+def test_the_order_of_references_is_irrelevant(seed, order):
+    scans = placed(5, seed)
+    at_once = LikelihoodField(COARSE, scans)
+    one_by_one = LikelihoodField(COARSE)
+    for k in order:
+        one_by_one.add(*scans[k])
+    shuffled = LikelihoodField(COARSE, [scans[k] for k in order])
+    assert all_bytes(at_once) == all_bytes(one_by_one) == all_bytes(shuffled)
+
+
+@given(seeds, poses)
+@settings(max_examples=15)
+def test_adding_and_removing_are_exact_opposites(seed, motion):
+    scans = placed(3, seed)
+    field = LikelihoodField(DEFAULT, scans)
+    before, snapshot = all_bytes(field), field.tiles
+    kept = [layer.copy() for layer in snapshot[:3]]
+    others = placed(2, seed + 1, motion)
+    for scan, pose in others:
+        field.add(scan, pose)
+    anew = all_bytes(LikelihoodField(DEFAULT, [*scans, *others]))
+    assert all_bytes(field).items() ^ before.items()
+    assert not all_bytes(field).items() ^ anew.items()
+    for scan, pose in others:
+        field.remove(scan, pose)
+    assert not all_bytes(field).items() ^ before.items()
+    # Who reads meanwhile reads on in what there was.
+    for layer, copy in zip(snapshot[:3], kept, strict=True):
+        np.testing.assert_array_equal(layer, copy)
+
+
+@pytest.mark.parametrize("x", [-60.0, 0.0, 60.0])
+@pytest.mark.parametrize("y", [-60.0, 0.0, 60.0])
+def test_the_map_grows_in_any_direction(x, y):
+    here, there = placed(1, 3), placed(1, 7, Pose2D(x, y, 1.0))
+    field = LikelihoodField(COARSE, here)
+    field.add(*there[0])
+    assert all_bytes(field) == all_bytes(LikelihoodField(COARSE, [*there, *here]))
+    for scan, pose in (*here, *there):
+        ends = np.floor(pose.apply(scan.points) / COARSE.resolution).astype(int)
+        assert all(code_at(field.tiles, *end) & FAR <= 15 for end in ends.tolist())
+
+
+@given(places, st.integers(0, 200), st.integers(0, 200))
+@settings(max_examples=25)
+def test_where_tiles_begin_does_not_matter(place, right, up):
+    # Moved by whole cells, every cell keeps its byte, whatever tile it falls into.
+    world, at = building(place % 4)
+    pose = at[place // 4]
+    scan = simulate(world, pose, WIDE, np.random.default_rng(place))
+    size = 2.0**-4  # exact in floating point
+    limits = FieldSettings(resolution=size, reach=0.5)
+    pose = Pose2D(round(pose.x * 64) / 64, round(pose.y * 64) / 64, pose.theta)
+    moved = Pose2D(pose.x + right * size, pose.y + up * size, pose.theta)
+    ours, theirs = LikelihoodField(limits, [(scan, pose)]), LikelihoodField(limits, [(scan, moved)])
+    cells = cells_around([(scan, pose)], limits, 300, place)
+    a = [code_at(ours.tiles, *cell) for cell in cells]
+    b = [code_at(theirs.tiles, cx + right, cy + up) for cx, cy in cells]
+    assert np.count_nonzero(np.array(a) != b) <= 2  # rounding at the border of a cell
+
+
+# Bad input is normal input.
+
+
+@given(st.lists(sweeps(), max_size=3), poses)
+def test_anything_a_message_may_hold_makes_a_map(scans, pose):
+    field = LikelihoodField(COARSE, [(scan, pose) for scan in scans])
+    before = all_bytes(field)
+    for scan in scans:
+        field.add(scan, pose)
+    for scan in scans:
+        field.remove(scan, pose)
+    assert all_bytes(field) == before
+
+
+def test_longer_readings_are_left_out():
+    scan = LaserScan(np.array([5.0, 45.0]), 0.0, 0.5)
+    tiles = LikelihoodField(DEFAULT, [(scan, Pose2D())]).tiles
+    assert code_at(tiles, 100, 0) & SURFACE
+    assert tiles.width * 64 * tiles.resolution < 20.0
+
+
+def test_references_on_two_continents_are_an_error_that_says_so():
+    scan = drawn(box(-2.0, -1.0, 2.0, 1.0), sensor=EXACT)
+    field = LikelihoodField(DEFAULT, [(scan, Pose2D())])
+    before = all_bytes(field)
+    with pytest.raises(AnchorscanError, match="km apart"):
+        field.add(scan, Pose2D(5e5, 5e6))
+    with pytest.raises(AnchorscanError, match="not finite"):
+        field.add(scan, Pose2D(math.nan, 0.0))
+    assert all_bytes(field) == before
+    # Far away, but together, is all right.
+    together = LikelihoodField(DEFAULT, [(scan, Pose2D(5e5, 5e6)), (scan, Pose2D(5e5 + 3.0, 5e6))])
+    assert len(together.tiles.table) < 100
