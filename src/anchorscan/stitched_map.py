@@ -63,6 +63,7 @@ class StitchedMap:
         begin = list(known)
         self._settings = settings
         self._weights = settings.field.weights()
+        self._readings = settings.belief.readings(settings.field)
         self._known = {each.reference.identifier: each for each in begin}
         self._relations = {identifier: self._relate(k) for identifier, k in self._known.items()}
         self._database = RelationshipDatabase(
@@ -124,9 +125,9 @@ class StitchedMap:
     def follow(
         self, scan: LaserScan, poses: NDArray[np.float64], stiffness: NDArray[np.float64]
     ) -> Fits:
-        """Refine expected poses of a scan, as `verification.follow` does."""
+        """Refine expected poses of a scan, and score them as the belief does."""
         settings = self._settings.verification
-        return follow(poses, stiffness, scan.points, self._field.tiles, self._weights, settings)
+        return follow(poses, stiffness, scan.points, self._field.tiles, self._readings, settings)
 
     def nearest(self, poses: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """Return the identifier of the reference taken nearest to each of (K, 3) poses.
