@@ -1,0 +1,268 @@
+"""The sieves between proposals and fits against plain twins, and what they must find."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scans import FULL_TURN, WIDE, building, seeds
+
+from anchorscan import Pose2D, Settings, simulate
+from anchorscan.field import LikelihoodField, cell_code, field_scores, passed_through, refined
+from anchorscan.proposal import spread
+from anchorscan.verification import FEATURES, Fits, VerificationSettings, verify
+from anchorscan.verification import _distinct as distinct
+
+FIELD = Settings.preset("default").field
+WEIGHTS = FIELD.weights()
+LIMITS = VerificationSettings()
+SMALL = VerificationSettings(third_poses=6, fits=4, iterations=2, followed=1, rays=8)
+SCORE, THROUGH = FEATURES.index("score"), FEATURES.index("through")
+NOBODY = np.empty((0, 2))
+
+
+@pytest.fixture(scope="module")
+def mapped():
+    """The map of a building, and scans of it with their poses."""
+    world, at = building(2)
+    rng = np.random.default_rng(0)
+    known = [(simulate(world, pose, FULL_TURN, rng), pose) for pose in at]
+    asked = [
+        (simulate(world, there, WIDE, rng), there)
+        for there in (pose @ Pose2D(0.2, -0.1, 0.4) for pose in at)
+    ]
+    return LikelihoodField(FIELD, known).tiles, asked
+
+
+def around(pose, rng, count):
+    """Poses near and far of one."""
+    size = np.repeat([0.1, 0.4, 3.0], -(-count // 3))[:count, np.newaxis]
+    return pose.to_array() + size * rng.normal(0.0, (1.0, 1.0, 0.3), (count, 3))
+
+
+# The twins.
+
+
+def plain_codes(pose, points, tiles):
+    cells = np.floor(Pose2D(*pose).apply(points) / tiles.resolution).astype(int)
+    return [int(cell_code(tiles, cx - tiles.column, cy - tiles.row)) for cx, cy in cells.tolist()]
+
+
+def plain_score(pose, points, tiles):
+    return float(np.mean([WEIGHTS[code] for code in plain_codes(pose, points, tiles)]))
+
+
+def plain_features(pose, points, tiles):
+    """Shares by the names of ``FEATURES``, but for the rays."""
+    codes = np.array(plain_codes(pose, points, tiles))
+    distance = (codes & 63) / 63 * tiles.reach
+    is_free = (codes & 64) > 0
+    is_far = (codes & 63) == 63
+    shares = {
+        "score": WEIGHTS[codes],
+        "near": distance <= 0.1,
+        "close": distance <= 0.2,
+        "free": is_far & is_free,
+        "unknown": is_far & ~is_free,
+        "through": [math.nan],
+        "off": ~is_far & is_free & (distance > 0.2),
+    }
+    return [float(np.mean(shares[name])) for name in FEATURES]
+
+
+def plain_distinct(poses, distance, turn, most):
+    chosen = []
+    for k, pose in enumerate(poses):
+        ours = Pose2D(*pose)
+        others = [Pose2D(*poses[j]) for j in chosen]
+        if len(chosen) < most and all(
+            ours.distance(other) >= distance or ours.turn(other) >= turn for other in others
+        ):
+            chosen.append(k)
+    return chosen
+
+
+def plain_best(poses, points, readings, tiles):
+    """Poses by their score with so many readings, best first, equals as they came."""
+    few = spread(points, readings)
+    return sorted(poses.tolist(), key=lambda pose: -plain_score(pose, few, tiles))
+
+
+def plain_verify(poses, points, tiles, limits):
+    best = plain_best(poses, points, limits.second_readings, tiles)[: limits.third_poses]
+    best = plain_best(np.array(best), points, limits.third_readings, tiles)
+    apart = plain_distinct(best, limits.distinct_distance, limits.distinct_turn, limits.fits)
+    fits = []
+    for k in apart:
+        pose = refined(
+            np.array(best[k]), spread(points, limits.fit_readings), tiles, limits.iterations
+        )
+        many = spread(points, limits.last_readings)
+        fits.append((pose, plain_features(pose, many, tiles)))
+    fits.sort(key=lambda fit: -fit[1][SCORE])
+    places = plain_distinct(
+        [pose for pose, _ in fits], limits.place_distance, limits.place_turn, len(fits)
+    )
+    fits = [fits[k] for k in places]
+    for pose, numbers in fits[: limits.followed]:
+        rays = spread(points, limits.rays)
+        numbers[THROUGH] = passed_through(pose, rays, tiles, limits.through_margin)
+    return fits
+
+
+def check_against_twin(poses, points, tiles, limits):
+    fits = verify(poses, points, tiles, WEIGHTS, limits)
+    expected = plain_verify(poses, points, tiles, limits)
+    assert len(fits) == len(fits.hessians) == len(fits.residuals) == len(expected)
+    for ours, (pose, _) in zip(fits.poses, expected, strict=True):
+        np.testing.assert_allclose(ours[:2], pose[:2], atol=1e-9)
+        assert Pose2D(*ours).turn(Pose2D(*pose)) < 1e-9
+    np.testing.assert_allclose(fits.features, [numbers for _, numbers in expected], atol=1e-6)
+    assert fits.readings == min(len(points), limits.last_readings)
+
+
+@pytest.mark.interpreted
+def test_a_few_poses_go_through_the_sieves_as_the_twins_say(mapped):
+    tiles, asked = mapped
+    scan, pose = asked[0]
+    poses = around(pose, np.random.default_rng(3), 9)
+    check_against_twin(poses, scan.points, tiles, SMALL)
+
+
+@given(seeds, st.sampled_from([LIMITS, SMALL]), st.integers(1, 80))
+@settings(max_examples=25)
+def test_poses_go_through_the_sieves_as_the_twins_say(mapped, seed, limits, count):
+    tiles, asked = mapped
+    scan, pose = asked[seed % len(asked)]
+    check_against_twin(around(pose, np.random.default_rng(seed), count), scan.points, tiles, limits)
+
+
+@given(seeds, st.integers(0, 30), st.integers(1, 8))
+def test_distinct_poses_are_the_twins(seed, count, most):
+    poses = np.random.default_rng(seed).normal(0.0, (0.5, 0.5, 2.0), (count, 3))
+    found = distinct(poses, 0.4, 0.5, most)
+    assert found.tolist() == plain_distinct(poses.tolist(), 0.4, 0.5, most)
+
+
+@given(st.integers(0, 400), st.integers(1, 200))
+def test_readings_are_chosen_evenly(count, most):
+    points = np.column_stack((np.arange(count), np.zeros(count))).astype(float)
+    chosen = spread(points, most)[:, 0]
+    assert len(chosen) == min(count, most)
+    steps = np.diff(chosen)
+    assert np.all(steps >= 1)
+    assert np.ptp(steps) <= 1 if len(steps) else True
+    if len(chosen):  # as many are left out before the first as behind the last
+        assert abs(chosen[0] - (count - 1 - chosen[-1])) <= 1
+
+
+# What they must find.
+
+
+def test_the_truth_comes_out_on_top(mapped):
+    tiles, asked = mapped
+    rng = np.random.default_rng(1)
+    errors = []
+    for scan, pose in asked:
+        wrong = [around(other, rng, 12) for _, other in asked]
+        near = pose @ Pose2D(0.15, -0.1, 0.05)
+        poses = np.concatenate([*wrong, near.to_array()[np.newaxis]])
+        fits = verify(poses, scan.points, tiles, WEIGHTS, LIMITS)
+        best = Pose2D(*fits.poses[0])
+        errors.append((best.distance(pose), best.turn(pose)))
+    # Here and there a place is seen from one side only and holds a pose less well.
+    assert np.all(np.max(errors, axis=0) < (0.25, math.radians(3.0)))
+    assert np.all(np.median(errors, axis=0) < (0.03, math.radians(0.5)))
+
+
+def test_fits_are_in_order_and_apart(mapped):
+    tiles, asked = mapped
+    rng = np.random.default_rng(2)
+    for scan, pose in asked[:6]:
+        poses = np.concatenate(
+            [around(other, rng, 12) for _, other in asked] + [around(pose, rng, 40)]
+        )
+        fits = verify(poses, scan.points, tiles, WEIGHTS, LIMITS)
+        assert 1 <= len(fits) <= LIMITS.fits
+        assert np.all(np.diff(fits.features[:, SCORE]) <= 0.0)
+        for a, b in itertools.combinations([Pose2D(*row) for row in fits.poses], 2):
+            apart = a.distance(b) >= LIMITS.place_distance
+            assert apart or a.turn(b) >= LIMITS.place_turn
+        assert np.all(
+            np.isnan(fits.features[:, THROUGH]) == (np.arange(len(fits)) >= LIMITS.followed)
+        )
+        shares = np.delete(fits.features, [SCORE, THROUGH], axis=1)
+        assert np.all((shares >= 0.0) & (shares <= 1.0))
+        np.testing.assert_array_equal(fits.hessians, fits.hessians.transpose(0, 2, 1))
+        assert np.all(np.linalg.eigvalsh(fits.hessians) > -1e-9)
+
+
+@given(seeds)
+@settings(max_examples=20)
+def test_the_order_of_the_proposals_does_not_matter(mapped, seed):
+    tiles, asked = mapped
+    rng = np.random.default_rng(seed)
+    scan, pose = asked[seed % len(asked)]
+    poses = around(pose, rng, 30)
+    ours = verify(poses, scan.points, tiles, WEIGHTS, LIMITS)
+    theirs = verify(rng.permutation(poses), scan.points, tiles, WEIGHTS, LIMITS)
+    # Poses that explain equally little stay in the order in which they came.
+    np.testing.assert_array_equal(ours.poses[0], theirs.poses[0])
+    np.testing.assert_array_equal(ours.features[0], theirs.features[0])
+
+
+def test_more_effort_finds_no_worse_a_fit(mapped):
+    tiles, asked = mapped
+    thorough = Settings.preset("thorough").verification
+    rng = np.random.default_rng(5)
+    for scan, pose in asked[:6]:
+        poses = around(pose, rng, 60)
+        ours = verify(poses, scan.points, tiles, WEIGHTS, LIMITS)
+        theirs = verify(poses, scan.points, tiles, WEIGHTS, thorough)
+        few = spread(scan.points, 120)
+        scores = field_scores(np.stack([ours.poses[0], theirs.poses[0]]), few, tiles, WEIGHTS)
+        assert scores[1] > scores[0] - 0.03
+
+
+# Bad input is normal input.
+
+
+@pytest.mark.interpreted
+def test_no_poses_have_no_fits(mapped):
+    fits = verify(np.empty((0, 3)), mapped[1][0][0].points, mapped[0], WEIGHTS, LIMITS)
+    assert len(fits) == 0
+    assert fits.poses.shape == (0, 3)
+    assert fits.features.shape == (0, len(FEATURES))
+
+
+@pytest.mark.parametrize("points", [NOBODY, np.array([[1.0, 0.5]]), np.full((5, 2), 1e6)])
+def test_a_scan_of_little_has_a_fit_that_tells_little(mapped, points):
+    poses = mapped[1][0][1].to_array()[np.newaxis]
+    fits = verify(poses, points, mapped[0], WEIGHTS, LIMITS)
+    assert len(fits) == 1
+    assert np.all(np.isfinite(fits.features))
+    assert np.all(np.isfinite(fits.poses))
+    assert fits.readings == len(points)
+
+
+def test_a_map_of_nothing_explains_nothing(mapped):
+    nothing = LikelihoodField(FIELD).tiles
+    scan, pose = mapped[1][0]
+    fits = verify(pose.to_array()[np.newaxis], scan.points, nothing, WEIGHTS, LIMITS)
+    assert fits.features[0, FEATURES.index("unknown")] == 1.0
+    assert fits.features[0, SCORE] == pytest.approx(FIELD.unknown_score)
+    np.testing.assert_allclose(fits.poses[0], pose.to_array())
+
+
+def test_some_of_the_fits():
+    rows = np.arange(12.0).reshape(4, 3)
+    fits = Fits(rows, np.zeros((4, 7)), np.zeros((4, 3, 3)), np.arange(4.0), 90)
+    some = fits[1:3]
+    assert len(some) == 2
+    np.testing.assert_array_equal(some.poses, rows[1:3])
+    assert some.residuals.tolist() == [1.0, 2.0]
+    assert some.readings == 90
