@@ -127,7 +127,7 @@ class BeliefSettings(BaseModel):
         distance = (np.arange(256) & 63) * field.reach / 63.0
         score = np.maximum(0.0, 1.0 - distance / self.sharpness)
         score[127] = score[255] = -self.free_penalty
-        return score.astype(np.float32)
+        return np.asarray(score, np.float32)
 
 
 @dataclass(frozen=True, eq=False)
