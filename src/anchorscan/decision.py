@@ -58,7 +58,7 @@ class DecisionSettings(BaseModel):
     )
     rivalry: float = Field(30.0, gt=0.0, description="of the fits for what the best leaves")
     elsewhere: float = Field(0.8, description="score with which 'somewhere else' competes")
-    threshold: float = Field(0.95, gt=0.0, le=1.0, description="probability that is an answer")
+    threshold: float = Field(0.96, gt=0.0, le=1.0, description="probability that is an answer")
     range_deviation: float = Field(
         0.03, gt=0.0, description="least standard deviation of a reading, metres"
     )
