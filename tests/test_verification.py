@@ -53,7 +53,7 @@ def plain_codes(pose, points, tiles):
 
 
 def plain_score(pose, points, tiles):
-    return float(np.mean([WEIGHTS[code] for code in plain_codes(pose, points, tiles)]))
+    return float(np.mean([float(WEIGHTS[code]) for code in plain_codes(pose, points, tiles)]))
 
 
 def plain_features(pose, points, tiles):
@@ -63,7 +63,7 @@ def plain_features(pose, points, tiles):
     is_free = (codes & 64) > 0
     is_far = (codes & 63) == 63
     shares = {
-        "score": WEIGHTS[codes],
+        "score": WEIGHTS.astype(float)[codes],
         "near": distance <= 0.1,
         "close": distance <= 0.2,
         "free": is_far & is_free,
