@@ -6,7 +6,6 @@ import io
 import json
 import math
 import os
-import shutil
 import subprocess
 import sys
 import warnings
@@ -221,7 +220,7 @@ def test_view_as_a_user_runs_it(tmp_path: Path) -> None:
     entities = ["/world/walls", "/world/scan", "/world/hypotheses", "/words"]
     for path in (saved, again):
         printed = subprocess.run(
-            [shutil.which("rerun") or "rerun", "rrd", "print", "-v", path],
+            [Path(sys.executable).with_name("rerun"), "rrd", "print", "-v", path],
             capture_output=True,
             text=True,
             check=True,
