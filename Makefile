@@ -65,8 +65,9 @@ release: setup ## build both distributions and try the wheel in an empty environ
 demo: setup ## build a map of MIT Killian Court and locate later visits in it
 	$(BIN)/anchorscan demo
 
-picture: setup ## draw the picture of the README again
+picture: setup ## draw the pictures of README and documentation again
 	$(BIN)/anchorscan demo --output docs/images
+	$(BIN)/python docs/pictures.py
 
 lock: setup ## resolve the pinned requirements anew, for Python 3.10 and later
 	$(BIN)/python -m pip install --quiet uv

@@ -138,14 +138,15 @@ class Viewer:
             views.Horizontal(
                 seen,
                 views.Vertical(
+                    views.TextLogView(origin="words", name="Answers"),
                     views.TimeSeriesView(origin="belief", name="Probability"),
                     views.TimeSeriesView(origin="time", name="Milliseconds"),
-                    views.TextLogView(origin="words", name="Answers"),
                 ),
                 column_shares=[2.2, 1.0],
             ),
-            views.TimePanel(timeline=_CLOCK),
-            collapse_panels=True,
+            views.TimePanel(timeline=_CLOCK, state="collapsed"),
+            views.BlueprintPanel(state="collapsed"),
+            views.SelectionPanel(state="collapsed"),
         )
 
     def _show_map(self, walls: NDArray[np.float64], poses: Sequence[Pose2D]) -> None:

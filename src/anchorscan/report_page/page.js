@@ -229,6 +229,18 @@ function drawSensor(frame, pose, fill, size, hollow) {
   context.restore();
 }
 
+// A short line from where a reference was taken to where it looked.
+function drawReference(frame, pose) {
+  const { context } = frame, x = frame.x(pose[0]), y = frame.y(pose[1]);
+  context.strokeStyle = colour("--soft");
+  context.lineWidth = 1;
+  context.beginPath();
+  context.arc(x, y, 1.5, 0, 7);
+  context.moveTo(x, y);
+  context.lineTo(x + 6 * Math.cos(pose[2]), y - 6 * Math.sin(pose[2]));
+  context.stroke();
+}
+
 function drawEllipse(frame, pose, spread, stroke) {
   const [xx, xy, yy] = spread;
   const middle = (xx + yy) / 2, half = Math.hypot((xx - yy) / 2, xy);
@@ -304,7 +316,7 @@ function drawMap() {
   const frame = frameOf(canvas, state.view), place = map();
   if (place) {
     drawWalls(frame, place);
-    for (const pose of place.references) drawSensor(frame, pose, colour("--faint"), 5);
+    for (const pose of place.references) drawReference(frame, pose);
   }
   // What matters most is drawn last.
   const layer = (kind) => (kind === "wrong" ? 2 : kind === "itself" ? 0 : 1);
@@ -406,13 +418,13 @@ function drawOverlay() {
   const found = hypothesis ? hypothesis.pose || hypothesis.inner : null;
   const pose = state.atTruth && each.truth ? each.truth : found || each.truth || [0, 0, 0];
   const points = placed(scanPoints(each.points), pose);
-  const low = [pose[0] - 1, pose[1] - 1], high = [pose[0] + 1, pose[1] + 1];
-  for (let i = 0; i < points.length; i += 2) {
-    if (Math.hypot(points[i] - pose[0], points[i + 1] - pose[1]) > 25) continue;
-    for (const k of [0, 1]) {
-      low[k] = Math.min(low[k], points[i + k] - 0.5);
-      high[k] = Math.max(high[k], points[i + k] + 0.5);
-    }
+  // A few readings down a corridor must not shrink the rest.
+  const [low, high] = [[pose[0] - 1, pose[1] - 1], [pose[0] + 1, pose[1] + 1]];
+  for (const k of [0, 1]) {
+    const values = points.filter((_, i) => i % 2 === k).sort();
+    if (!values.length) continue;
+    low[k] = Math.min(low[k], values[Math.floor(0.04 * values.length)] - 0.7);
+    high[k] = Math.max(high[k], values[Math.ceil(0.96 * values.length) - 1] + 0.7);
   }
   const frame = frameOf(canvas, fitting(canvas, low, high));
   const inSet = Boolean(hypothesis && hypothesis.pose);
@@ -653,8 +665,11 @@ function symbol(kind) {
   const stroke = (name) => `fill:none;stroke:var(${name});stroke-width:2`;
   if (kind === "wrong") {
     svg.append(make("path", { d: "M3 3L11 11M3 11L11 3", style: stroke("--wrong") }));
-  } else if (kind === "reference" || kind === "best" || kind === "scan" || kind === "truth") {
-    const fill = { reference: "--faint", best: "--reference", scan: "--right", truth: null }[kind];
+  } else if (kind === "reference") {
+    svg.append(make("path", { d: "M2 7H12", style: "stroke:var(--soft)" }),
+      make("circle", { cx: 3, cy: 7, r: 2, style: "fill:none;stroke:var(--soft)" }));
+  } else if (kind === "best" || kind === "scan" || kind === "truth") {
+    const fill = { best: "--reference", scan: "--right", truth: null }[kind];
     svg.append(make("path", { d: "M12 7L3 12V2Z",
       style: fill ? `fill:var(${fill});stroke:var(--ink)` : stroke("--truth") }));
   } else if (kind === "right" || kind === "located") {
