@@ -87,12 +87,9 @@ def words(figure: object) -> str:
     return "\n".join(text.get_text() for text in found)
 
 
-@THEMES
 @pytest.mark.parametrize("name", PICTURES)
-def test_every_picture_can_be_drawn_of_every_trace(
-    name: str, theme: Theme, odd: dict[str, Explanation]
-) -> None:
-    for what, each in odd.items():
+def test_every_picture_can_be_drawn_of_every_trace(name: str, odd: dict[str, Explanation]) -> None:
+    for theme, (what, each) in zip(itertools.cycle([LIGHT, DARK]), odd.items(), strict=False):
         figure = draw(each, name, theme)
         panels = [axes for axes in figure.axes if axes.has_data() or axes.texts]
         assert panels, f"{what}: nothing is drawn and nothing said"
@@ -198,7 +195,7 @@ def test_files_appear_whole_one_for_each_picture_and_theme(
 def test_the_same_trace_gives_the_same_file(explanation: Explanation, tmp_path: Path) -> None:
     from anchorscan.drawing import save
 
-    for kind in ("png", "svg", "pdf"):
+    for kind in ("png", "svg"):
         first, second = tmp_path / f"a.{kind}", tmp_path / f"b.{kind}"
         for path in (first, second):
             save(draw(explanation, "5-matching-angles"), path)
