@@ -297,6 +297,12 @@ def _to_units(angle):  # type: ignore[no-untyped-def]
 
 
 @kernel
+def _apart(a, b):  # type: ignore[no-untyped-def]
+    """How far two angles are apart, from 0 to half a turn, in 65,536ths of one."""
+    return abs(np.int64(np.int16(a - b)))
+
+
+@kernel
 def _fold(units):  # type: ignore[no-untyped-def]
     """65,536ths of a turn modulo a quarter turn, from minus to plus an eighth."""
     return ((units + _QUARTER // 2) & (_QUARTER - 1)) - _QUARTER // 2
@@ -398,9 +404,9 @@ def _corresponding(edge, middle, group, block, known, limits, out, found):  # ty
             # With ends of one kind either may be either: the other way round is half a turn.
             half = flip * (_TURN // 2)
             first, second = (turn_a, turn_b) if flip == 0 else (turn_b, turn_a)
-            if abs(np.int16(known.turns[e, 1] - first + half)) > turn_tolerance:
+            if _apart(known.turns[e, 1], first - half) > turn_tolerance:
                 continue
-            if abs(np.int16(known.turns[e, 2] - second + half)) > turn_tolerance:
+            if _apart(known.turns[e, 2], second - half) > turn_tolerance:
                 continue
             units = known.turns[e, 0] - bearing + half
             if askew != _UNKNOWN and known.turns[e, 3] != _UNKNOWN:
@@ -467,7 +473,8 @@ def _propose(query, chosen, known, tiles, limits):  # type: ignore[no-untyped-de
             out[kept] = out[k]
             scores[kept] = score
             kept += 1
-    poses, values = _highest(out[:kept], scores[:kept], 127 * len(chosen), limits[7])
+    full = 127 * max(len(chosen), 1)
+    poses, values = _highest(out[:kept], scores[:kept], full, limits[7])
     return poses, values, found
 
 
