@@ -16,16 +16,32 @@ import typer
 from pydantic import BaseModel
 
 from anchorscan.cli import app
+from anchorscan.robot_parameters import RobotParameters
 from anchorscan.settings import PRESETS, Settings
 
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
     """Put what a page asks for in the place of the comment (called by mkdocs)."""
-    for name, make in {"commands": commands, "settings": settings}.items():
+    for name, make in _MARKS.items():
         mark = f"<!-- {name} -->"
         if mark in markdown:
             markdown = markdown.replace(mark, make())
     return markdown
+
+
+def robot_parameters() -> str:
+    """The parameters of the ROS 2 node."""
+    rows = [
+        (f"`{name}`", _as_yaml(default), meaning)
+        for name, (default, meaning) in RobotParameters.meanings().items()
+    ]
+    return "\n".join(_table(("parameter", "default", "meaning"), rows))
+
+
+def _as_yaml(value: Any) -> str:
+    if value is None or value == "":
+        return ""
+    return f"`{str(value).lower() if isinstance(value, bool) else value}`"
 
 
 def commands() -> str:
@@ -156,3 +172,6 @@ def _table(names: tuple[str, ...], rows: Iterable[Iterable[str]]) -> list[str]:
         return "| " + " | ".join(shown) + " |"
 
     return [line(names), line("---" for _ in names), *map(line, rows)]
+
+
+_MARKS = {"commands": commands, "settings": settings, "robot parameters": robot_parameters}

@@ -7,6 +7,7 @@ kinds ``console``, ``pycon`` and ``text`` are what somebody saw, and are not run
 from __future__ import annotations
 
 import gzip
+import html
 import importlib.util
 import json
 import os
@@ -287,6 +288,15 @@ def test_every_setting_is_documented_with_its_value(site: Path) -> None:
         assert row is not None, name
         if isinstance(value, float):
             assert float(row[1].split()[0]) == pytest.approx(value, rel=1e-3), name
+
+
+def test_every_parameter_of_the_robot_is_documented(site: Path) -> None:
+    from anchorscan.robot_parameters import RobotParameters
+
+    text = (site / "robot" / "index.html").read_text(encoding="utf-8")
+    for name, (_, meaning) in RobotParameters.meanings().items():
+        assert f"<td><code>{name}</code></td>" in text
+        assert meaning.split(";")[0] in html.unescape(text)
 
 
 def test_every_public_name_is_documented(site: Path) -> None:
