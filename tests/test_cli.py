@@ -148,6 +148,22 @@ def test_results_go_to_a_file_as_they_go_to_stdout(
     assert [path.name for path in tmp_path.iterdir()] == ["out.jsonl"]
 
 
+def test_a_drive_is_tracked_from_nothing(
+    run: Run, log: Path, places: Path, records: list[Record], tmp_path: Path
+) -> None:
+    output = tmp_path / "track.jsonl"
+    done = run("track", places, log, "-o", output)
+    assert done.code == 0
+    lines = [json.loads(line) for line in output.read_text(encoding="utf-8").splitlines()]
+    assert [line["scan"] for line in lines] == [record.index for record in records]
+    last, truth = lines[-1], records[-1].pose
+    assert last["accepted"]
+    assert truth is not None
+    assert math.hypot(last["x"] - truth.x, last["y"] - truth.y) < 0.5
+    assert [len(row) for row in last["covariance"]] == [3, 3, 3]
+    assert 0.9 < last["probability"] <= 1.0
+
+
 def test_processes_share_the_work_and_change_nothing(log: Path, places: Path) -> None:
     # In processes of their own: pytest's captured streams do not survive a spawn.
     outcomes = []
@@ -256,7 +272,7 @@ def test_settings_come_from_a_preset_or_a_file(
 def test_version_and_help(run: Run) -> None:
     assert run("--version").out == f"anchorscan {__version__}\n"
     text = run("--help").out
-    for name in ("build", "locate", "explain", "info", "bench", "check-map", "demo"):
+    for name in ("build", "locate", "track", "explain", "info", "bench", "check-map", "demo"):
         assert f"\n  {name} " in text
         assert run(name, "--help").code == 0
 

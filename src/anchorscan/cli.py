@@ -329,6 +329,42 @@ def locate(
 
 @app.command()
 @_guarded
+def track(
+    set_file: SetArgument,
+    log: LogArgument,
+    output: Annotated[
+        Path | None,
+        typer.Option("--output", "-o", metavar="OUT", help="File for the JSON lines, not stdout."),
+    ] = None,
+    field_of_view: FieldOfViewOption = None,
+    range_max: RangeMaxOption = None,
+    topic: TopicOption = None,
+    upside_down: UpsideDownOption = False,
+    preset: PresetOption = None,
+    settings_file: SettingsOption = None,
+) -> None:
+    """Follow a robot through a log: scans and odometry in order, with no prior.
+
+    One JSON object a scan; "accepted" says whether the robot is located. The poses are those
+    of the laser in the frame of the set, in metres and radians.
+    """
+    opened = _open_log(log, _reading(field_of_view, range_max, topic, upside_down))
+    settings = _read_settings(preset, settings_file)
+    records: Iterable[Record] = _records(opened)
+    if output is not None or not sys.stdout.isatty():
+        records = _progress(records, "tracking", opened.count)
+    accepted = count = 0
+    with _writing(output) as stream:
+        for line in _tracked(records, set_file, settings):
+            stream.write(json.dumps(line, allow_nan=False) + "\n")
+            stream.flush()
+            count += 1
+            accepted += line["accepted"]
+    _say(f"{log}: {count} scans: located after {accepted}, not known after {count - accepted}")
+
+
+@app.command()
+@_guarded
 def explain(
     set_file: SetArgument,
     log: LogArgument,
@@ -865,6 +901,35 @@ class _Locator:
         if record.scan is None:
             return record.problem
         return "no reading is a return" if len(self._places) else "the set has no references"
+
+
+def _tracked(
+    records: Iterable[Record], set_file: Path, settings: Settings | None
+) -> Iterator[dict[str, Any]]:
+    """Yield the line of ``track`` for every record."""
+    from .localizer import Localizer
+    from .reference_set import ReferenceSet
+
+    places = ReferenceSet.open(set_file, settings=settings)
+    places.prepare()
+    localizer = Localizer(places)
+    for record in records:
+        line: dict[str, Any] = {"scan": record.index, "stamp": record.stamp}
+        if record.scan is None:
+            yield {**line, "seconds": 0.0, "accepted": False, "reason": record.problem}
+            continue
+        start = time.perf_counter()
+        belief = localizer.update(record.scan, record.odometry, record.stamp)
+        line["seconds"] = round(time.perf_counter() - start, _DECIMALS + 1)
+        line["accepted"] = bool(belief.accepted)
+        line |= _pose_line(belief.pose)
+        spread = belief.covariance
+        line["covariance"] = (
+            None if spread is None else [[_significant(value) for value in row] for row in spread]
+        )
+        line["probability"] = round(belief.probability, _DECIMALS)
+        line["state"] = belief.state
+        yield line
 
 
 def _hypothesis_line(hypothesis: Hypothesis) -> dict[str, Any]:
