@@ -16,11 +16,13 @@ from anchorscan import (
     Record,
     ReferenceSet,
     SensorModel,
+    Settings,
     drive,
     random_building,
     simulate,
 )
-from anchorscan.decision import held
+from anchorscan.decision import DecisionSettings, covariance, decide, evidence, held
+from anchorscan.verification import FEATURES, Fits
 from anchorscan.world import World
 
 
@@ -85,3 +87,166 @@ def test_a_pose_that_is_exact_is_held_and_one_that_is_not_is_not() -> None:
     assert held(np.zeros((3, 3))) == 1.0
     assert held(np.diag([25.0, 1e-4, 1e-6])) < 0.1
     assert held(np.diag([1e-4, 1e-4, 1.0])) < 0.2
+
+
+# Fits as the verification gives them, with only those numbers that the decision looks at.
+
+SETTINGS = [Settings.preset(name).decision for name in ("default", "thorough")]
+PRESETS = pytest.mark.parametrize("preset", SETTINGS, ids=["default", "thorough"])
+SCORE, THROUGH = FEATURES.index("score"), FEATURES.index("through")
+FIRM = np.diag([3e4, 3e4, 1e6])
+
+
+def fits_of(
+    scores: list[float],
+    through: float = 0.0,
+    hessian: NDArray[np.float64] = FIRM,
+    readings: int = 120,
+) -> Fits:
+    features = np.full((len(scores), len(FEATURES)), math.nan)
+    features[:, SCORE], features[:1, THROUGH] = scores, through
+    hessians = np.repeat(hessian[np.newaxis], len(scores), axis=0)
+    return Fits(
+        np.zeros((len(scores), 3)), features, hessians, np.full(len(scores), 1e-4), readings
+    )
+
+
+shares = st.floats(0.0, 1.0)
+scores_of_fits = st.lists(st.floats(-0.7, 1.0), min_size=1, max_size=8).map(
+    lambda scores: sorted(scores, reverse=True)
+)
+
+
+@PRESETS
+@given(scores=scores_of_fits, through=shares, readings=st.integers(0, 500))
+def test_probabilities_are_shared_out_in_order(
+    preset: DecisionSettings, scores: list[float], through: float, readings: int
+) -> None:
+    decision = decide(fits_of(scores, through, readings=readings), preset)
+    assert decision.probabilities.shape == (len(scores),)
+    assert np.all(decision.probabilities >= 0.0)
+    assert decision.elsewhere >= 0.0
+    assert decision.probabilities.sum() + decision.elsewhere == pytest.approx(1.0)
+    # Best first: no fit is likelier than one that explains more of the scan.
+    assert np.all(np.diff(decision.probabilities) <= 1e-15)
+    assert decision.accepted == (decision.probabilities[0] >= preset.threshold)
+
+
+@PRESETS
+@given(a=shares, b=shares, rival=st.floats(-0.7, 1.0))
+def test_a_better_score_is_never_less_likely(
+    preset: DecisionSettings, a: float, b: float, rival: float
+) -> None:
+    low, high = sorted((max(a, rival), max(b, rival)))
+    worse, better = (decide(fits_of([score, rival]), preset) for score in (low, high))
+    assert better.probabilities[0] >= worse.probabilities[0]
+
+
+@PRESETS
+@given(score=shares, a=st.floats(-0.7, 1.0), b=st.floats(-0.7, 1.0))
+def test_a_wider_margin_is_never_less_likely(
+    preset: DecisionSettings, score: float, a: float, b: float
+) -> None:
+    low, high = sorted((min(a, score), min(b, score)))
+    near, far = (decide(fits_of([score, rival]), preset) for rival in (high, low))
+    assert far.probabilities[0] >= near.probabilities[0]
+    assert far.elsewhere + far.probabilities[0] >= near.probabilities[0]
+
+
+@PRESETS
+@given(score=shares, a=shares, b=shares)
+def test_seeing_through_walls_is_never_likelier(
+    preset: DecisionSettings, score: float, a: float, b: float
+) -> None:
+    few, many = (decide(fits_of([score, 0.3], share), preset) for share in sorted((a, b)))
+    assert few.probabilities[0] >= many.probabilities[0]
+
+
+@PRESETS
+@given(score=shares, a=st.integers(0, 400), b=st.integers(0, 400))
+def test_more_readings_are_never_less_likely(
+    preset: DecisionSettings, score: float, a: int, b: int
+) -> None:
+    low, high = (decide(fits_of([score, 0.2], readings=n), preset) for n in sorted((a, b)))
+    assert high.probabilities[0] >= low.probabilities[0]
+
+
+@PRESETS
+def test_a_scan_that_one_place_explains_is_an_answer_and_one_that_two_do_is_none(
+    preset: DecisionSettings,
+) -> None:
+    assert decide(fits_of([0.95, 0.45]), preset).accepted
+    twins = decide(fits_of([0.95, 0.95]), preset)
+    assert not twins.accepted
+    assert twins.probabilities[1] > 0.5 * twins.probabilities[0]
+    assert not decide(fits_of([0.3, 0.1]), preset).accepted
+
+
+@PRESETS
+def test_a_single_fit_stands_for_itself(preset: DecisionSettings) -> None:
+    alone = decide(fits_of([0.9]), preset)
+    assert alone.probabilities.shape == (1,)
+    assert alone.elsewhere == pytest.approx(1.0 - alone.probabilities[0])
+    # As if the rival scored half as much.
+    rivalled = decide(fits_of([0.9, 0.45]), preset)
+    assert alone.probabilities[0] == rivalled.probabilities[0]
+
+
+@PRESETS
+def test_without_a_fit_the_scan_is_from_elsewhere(preset: DecisionSettings) -> None:
+    nothing = decide(fits_of([]), preset)
+    assert nothing.probabilities.shape == (0,)
+    assert nothing.elsewhere == 1.0
+    assert not nothing.accepted
+
+
+@given(
+    constant=st.floats(-1e6, 1e6),
+    elsewhere=st.floats(-1e3, 1e3),
+    rivalry=st.floats(1e-3, 1e4),
+    scores=scores_of_fits,
+)
+def test_settings_out_of_all_proportion_still_give_probabilities(
+    constant: float, elsewhere: float, rivalry: float, scores: list[float]
+) -> None:
+    odd = DecisionSettings(constant=constant, elsewhere=elsewhere, rivalry=rivalry)
+    decision = decide(fits_of(scores), odd)
+    assert np.all((decision.probabilities >= 0.0) & (decision.probabilities <= 1.0))
+    assert decision.probabilities.sum() + decision.elsewhere == pytest.approx(1.0)
+
+
+@given(st.integers(0, 2**31 - 1), st.integers(0, 5))
+@settings(max_examples=40)
+def test_covariances_are_the_inverse_of_the_information(seed: int, count: int) -> None:
+    rng = np.random.default_rng(seed)
+    slopes = rng.normal(0.0, 10.0, (count, 20, 3))
+    slopes[:, int(rng.integers(0, 20)) :] = 0.0  # some are held in one direction, or in none
+    hessians = np.einsum("fni,fnj->fij", slopes, slopes)
+    fits = Fits(
+        np.zeros((count, 3)), np.zeros((count, 7)), hessians, rng.uniform(0.0, 0.01, count), 120
+    )
+    limits = SETTINGS[0]
+    found = covariance(fits, limits)
+    for ours, hessian, residual in zip(found, hessians, fits.residuals, strict=True):
+        noise = max(residual, limits.range_deviation**2) * limits.readings_alike
+        information = hessian / noise + np.eye(3) / limits.widest_deviation**2
+        np.testing.assert_allclose(ours, np.linalg.inv(information), rtol=1e-6, atol=1e-12)
+        np.testing.assert_array_equal(ours, ours.T)
+        sizes = np.linalg.eigvalsh(ours)
+        assert sizes[0] > 0.0
+        assert sizes[-1] <= limits.widest_deviation**2 * (1.0 + 1e-6)
+
+
+@PRESETS
+def test_a_pose_that_nothing_holds_is_no_answer(preset: DecisionSettings) -> None:
+    corridor = np.diag([0.0, 3e4, 1e6])
+    assert decide(fits_of([0.99, 0.3]), preset).accepted
+    assert not decide(fits_of([0.99, 0.3], hessian=corridor), preset).accepted
+    assert not decide(fits_of([0.99, 0.3], hessian=np.zeros((3, 3))), preset).accepted
+
+
+def test_evidence_is_what_the_text_says() -> None:
+    numbers = evidence(fits_of([0.9, 0.7], 0.04))
+    expected = [1.0, math.log(0.2), -math.log(0.1), 0.2]
+    np.testing.assert_allclose(numbers, expected)
+    assert np.all(np.isfinite(evidence(fits_of([1.0, 1.0], readings=0))))

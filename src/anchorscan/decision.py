@@ -18,7 +18,8 @@ neither changes an answer, since what was answered there is held to 9 cm in 99 o
 without them a scan with a single reading is an answer.
 
 What is left goes to the other fits and to "somewhere else", in proportion to
-``exp(rivalry * score)``; "somewhere else" competes with a fixed score.
+``exp(rivalry * score)``; "somewhere else" competes with a fixed score.  No fit gets more than
+the best: what that would be is "somewhere else", too.
 
 The coefficients come from ``anchorscan calibrate``, which fits them on some buildings and
 reports on the others, in turn; what it gave stands on the calibration page of the
@@ -94,7 +95,7 @@ def evidence(fits: Fits) -> NDArray[np.float64]:
     rival = float(fits.features[1, _SCORE]) if len(fits) > 1 else 0.5 * score
     margin = max(score - rival, _SMALLEST_MARGIN)
     rest = 1.0 - min(score, _LARGEST_SCORE)
-    rest += _LUCKY_READINGS * max(0.0, 1.0 / fits.readings - 1.0 / _MANY_READINGS)
+    rest += _LUCKY_READINGS * max(0.0, 1.0 / max(fits.readings, 1) - 1.0 / _MANY_READINGS)
     explained = -math.log(rest)
     through = float(fits.features[0, _THROUGH])
     return np.array([1.0, math.log(margin), explained, math.sqrt(through)])
@@ -161,12 +162,16 @@ def decide(fits: Fits, settings: DecisionSettings) -> Decision:
         settings.explained,
         settings.through,
     )
-    place = 1.0 / (1.0 + math.exp(-float(np.dot(evidence(fits), weights))))
+    place = _logistic(float(np.dot(evidence(fits), weights)))
     best = place * held(covariance(fits[:1], settings)[0])
-    rivals = [
-        math.exp(settings.rivalry * (score - 1.0))
-        for score in (*fits.features[1:, _SCORE].tolist(), settings.elsewhere)
-    ]
-    share = (1.0 - best) / sum(rivals)
-    probabilities = np.array([best, *(share * rival for rival in rivals[:-1])])
-    return Decision(probabilities, share * rivals[-1], best >= settings.threshold)
+    scores = np.append(fits.features[1:, _SCORE], settings.elsewhere)
+    rivals = np.exp(settings.rivalry * (scores - scores.max()))
+    shares = (1.0 - best) * rivals[:-1] / rivals.sum()
+    probabilities = np.array([best, *np.minimum(shares, best)])
+    left = max(1.0 - float(probabilities.sum()), 0.0)
+    return Decision(probabilities, left, best >= settings.threshold)
+
+
+def _logistic(value: float) -> float:
+    """Return 1 / (1 + exp(-value)) for any value."""
+    return 0.5 * (1.0 + math.tanh(0.5 * value))
