@@ -77,12 +77,17 @@ class BeliefSettings(BaseModel):
     free_penalty: float = Field(
         0.5, ge=0.0, description="score that a reading in known free space loses"
     )
-    see_through: float = Field(3.0, ge=0.0, description="weight of the rays that see through")
-    benefit: float = Field(0.5, description="log odds of a place whose view may be blocked")
-    blocked: float = Field(6.0, ge=0.0, description="weight of the readings that may be blocked")
-    blocked_through: float = Field(
-        20.0, ge=0.0, description="weight of the rays that see through, where some are blocked"
+    see_through: float = Field(
+        6.3, ge=0.0, description="weight of the root of the share of rays that see through"
     )
+    shown_likelihood: float = Field(
+        3.5, gt=0.0, description="the same as likelihood, of the readings that may not be blocked"
+    )
+    shown_elsewhere: float = Field(
+        0.917, gt=0.0, lt=1.0, description="the same as elsewhere, of those readings"
+    )
+    doubt: float = Field(0.9, ge=0.0, description="log odds against a view that may be blocked")
+    benefit: float = Field(0.5, description="most log odds for a view that may be blocked")
     most_against: float = Field(6.0, gt=0.0, description="log odds that one scan can take")
     most_for: float = Field(4.0, gt=0.0, description="log odds that one scan can give")
     support: float = Field(
@@ -222,19 +227,20 @@ def log_odds(fits: Fits, settings: BeliefSettings) -> NDArray[np.float64]:
     score, close, free, unknown, through = fits.features[
         :, [_SCORE, _CLOSE, _FREE, _UNKNOWN, _THROUGH]
     ].T
-    least = math.log(1.0 - settings.elsewhere)
-    known = np.maximum(1.0 - unknown, _SMALLEST_SHARE)
-    rest = 1.0 - np.clip(score / known, 0.0, _LARGEST_SCORE)
-    plain = known * settings.likelihood * (least - np.log(rest)) - settings.see_through * through
+    against = settings.see_through * np.sqrt(through)
+    seen = np.maximum(1.0 - unknown, _SMALLEST_SHARE)
+    plain = settings.likelihood * seen * _excess(score / seen, settings.elsewhere) - against
     shown = np.maximum(close, _SMALLEST_SHARE)
-    rest = 1.0 - np.clip((score + 0.5 * free) / shown, 0.0, _LARGEST_SCORE)
-    blocked = (
-        close * settings.likelihood * (least - np.log(rest))
-        - settings.blocked * np.maximum(1.0 - close - unknown, 0.0)
-        - settings.blocked_through * through
-    )
+    rest = _excess((score + settings.free_penalty * free) / shown, settings.shown_elsewhere)
+    blocked = settings.shown_likelihood * shown * rest - settings.doubt - against
     odds = np.maximum(plain, np.minimum(blocked, settings.benefit))
     return np.asarray(np.clip(odds, -settings.most_against, settings.most_for))
+
+
+def _excess(score: NDArray[np.float64], elsewhere: float) -> NDArray[np.float64]:
+    """Logarithm of how much less a score leaves unexplained than the rest of the world."""
+    rest = 1.0 - np.clip(score, 0.0, _LARGEST_SCORE)
+    return math.log(1.0 - elsewhere) - np.log(rest)
 
 
 def weighed(
