@@ -25,12 +25,12 @@ from typing import Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from .hypothesis import Hypothesis
+from .localizer import Belief
 from .pose import Pose2D, wrap_angle
 from .reference_set import ReferenceSet
 from .scan import LaserScan
 
-__all__ = ["Belief", "Odometry", "Report", "Robot", "SingleScans", "State", "Tracker", "of_base"]
+__all__ = ["Odometry", "Report", "Robot", "SingleScans", "State", "Tracker", "of_base"]
 
 State = Literal["located", "ambiguous", "lost"]
 
@@ -43,63 +43,16 @@ _REACH = 0.25
 # Farther than this and faster than this no robot drives between two messages, metres, and a
 # second.
 _JUMP, _SPEED = 0.5, 5.0
-# The second best place explains the scan alike from this share of the best one's probability.
-_ALIKE = 0.3
-
-
-class Belief(Protocol):
-    """What a tracker believes after a scan."""
-
-    @property
-    def pose(self) -> Pose2D | None:
-        """``T_map_laser``, the best guess."""
-
-    @property
-    def covariance(self) -> NDArray[np.float64] | None:
-        """(3, 3) of its x, y (metres) and theta (radians), map frame."""
-
-    @property
-    def probability(self) -> float:
-        """That it is right."""
-
-    @property
-    def accepted(self) -> bool:
-        """Whether it may be acted on."""
-
-    @property
-    def hypotheses(self) -> tuple[Hypothesis, ...]:
-        """Of the laser, best first."""
 
 
 class Tracker(Protocol):
-    """A belief over time; poses are those of the laser in the frame of the set."""
+    """A belief over time, as a `Localizer` is; poses are those of the laser, set's frame."""
 
     def update(self, scan: LaserScan, odometry: Pose2D | None, stamp: float) -> Belief:
         """Take a scan, ``T_odom_laser`` where known, and the time in seconds."""
 
     def reset(self) -> None:
         """Know nothing."""
-
-
-@dataclass(frozen=True, eq=False)
-class _SingleBelief:
-    hypotheses: tuple[Hypothesis, ...]
-
-    @property
-    def pose(self) -> Pose2D | None:
-        return self.hypotheses[0].pose if self.hypotheses else None
-
-    @property
-    def covariance(self) -> NDArray[np.float64] | None:
-        return self.hypotheses[0].covariance if self.hypotheses else None
-
-    @property
-    def probability(self) -> float:
-        return self.hypotheses[0].probability if self.hypotheses else 0.0
-
-    @property
-    def accepted(self) -> bool:
-        return bool(self.hypotheses) and self.hypotheses[0].accepted
 
 
 class SingleScans:
@@ -114,7 +67,10 @@ class SingleScans:
 
     def update(self, scan: LaserScan, odometry: Pose2D | None, stamp: float) -> Belief:
         """Locate the scan."""
-        return _SingleBelief(tuple(self._places.locate(scan)))
+        hypotheses = tuple(self._places.locate(scan))
+        elsewhere = max(0.0, 1.0 - sum(each.probability for each in hypotheses))
+        accepted = bool(hypotheses) and hypotheses[0].accepted
+        return Belief(hypotheses, elsewhere, accepted)
 
     def reset(self) -> None:
         """Forget nothing."""
@@ -269,13 +225,10 @@ def _report(
         for each in belief.hypotheses
         if each.pose is not None
     )
-    state: State = "located" if belief.accepted and T_map_base is not None else "lost"
-    if state == "lost" and len(places) > 1 and places[1][1] >= _ALIKE * places[0][1]:
-        state = "ambiguous"
     known = T_map_base is not None and T_odom_base is not None
     return Report(
         stamp=stamp,
-        state=state,
+        state=belief.state,
         T_map_base=T_map_base,
         covariance=covariance,
         probability=belief.probability,

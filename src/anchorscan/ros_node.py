@@ -28,11 +28,12 @@ from .errors import AnchorscanError, LogError, ScanError, SettingsError
 from .io.frames import frame_name
 from .io.scan_message import scan_from_message
 from .io.spatial import matrix_of, planar, tilt
+from .localizer import Localizer
 from .mailbox import Closed, Mailbox
 from .occupancy import OccupancyGrid, reference_scans
 from .pose import Pose2D
 from .reference_set import ReferenceSet
-from .robot import Report, Robot, SingleScans, Tracker
+from .robot import Report, Robot, SingleScans
 from .robot_parameters import RobotParameters
 from .scan import LaserScan
 from .settings import Settings
@@ -422,10 +423,10 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
 
     def _adopt(self, places: ReferenceSet) -> None:
         """Locate among other references from now on, with nothing known in them."""
-        tracker: Tracker = SingleScans(places)
         with self._lock:
             odometry = None if self._robot is None else self._robot.odometry
-            self._places, self._robot, self._report = places, Robot(tracker, odometry), None
+            self._places, self._robot = places, Robot(Localizer(places), odometry)
+            self._report = None
 
     def _use_scan(self, message: Any) -> None:
         try:
