@@ -26,6 +26,10 @@ def graph_of(lengths):
     return AnchorGraph(anchors, np.zeros((count, 2), np.int32), lengths, np.zeros(count))
 
 
+def by_length(count_once=False):
+    return DatabaseSettings(relation="length", length_tolerance=TOLERANCE, count_once=count_once)
+
+
 def corresponds(a, b):
     return abs(a - float(np.float32(b))) <= TOLERANCE
 
@@ -72,7 +76,7 @@ lengths = st.lists(st.floats(0.0, 6.0).map(lambda v: round(v, 2)), max_size=12)
 @given(lengths, st.lists(lengths, max_size=6), st.booleans())
 def test_counts_and_quality_are_those_of_plain_counting(query, references, count_once):
     graphs = {10 * k: graph_of(each) for k, each in enumerate(references)}
-    settings = DatabaseSettings(length_tolerance=TOLERANCE, count_once=count_once)
+    settings = by_length(count_once)
     votes = RelationshipDatabase(settings, graphs.items()).votes(graph_of(query))
 
     expected = plain_votes(graph_of(query), graphs, count_once)
@@ -83,7 +87,7 @@ def test_counts_and_quality_are_those_of_plain_counting(query, references, count
 
 @given(lengths, st.lists(lengths, max_size=8), st.integers(1, 9))
 def test_the_best_few_are_the_first_of_all(query, references, most):
-    settings = DatabaseSettings(length_tolerance=TOLERANCE)
+    settings = by_length()
     graphs = [(k, graph_of(each)) for k, each in enumerate(references)]
     searched = RelationshipDatabase(settings, graphs)
 
@@ -94,7 +98,7 @@ def test_the_best_few_are_the_first_of_all(query, references, most):
 
 @given(lengths.filter(bool))
 def test_counted_once_a_graph_corresponds_fully_to_itself(each):
-    settings = DatabaseSettings(length_tolerance=TOLERANCE, count_once=True)
+    settings = by_length(True)
     votes = RelationshipDatabase(settings, [(3, graph_of(each))]).votes(graph_of(each))
 
     assert votes.quality.tolist() == [1.0]
@@ -104,7 +108,7 @@ def test_counted_once_a_graph_corresponds_fully_to_itself(each):
 def test_the_order_of_the_references_does_not_matter(query, order):
     rng = np.random.default_rng(2)
     graphs = [(k, graph_of(rng.uniform(0, 6, 5).round(1))) for k in range(5)]
-    settings = DatabaseSettings(length_tolerance=TOLERANCE)
+    settings = by_length()
 
     straight = RelationshipDatabase(settings, graphs).votes(graph_of(query))
     shuffled = RelationshipDatabase(settings, [graphs[k] for k in order]).votes(graph_of(query))
@@ -115,22 +119,22 @@ def test_the_order_of_the_references_does_not_matter(query, order):
 class ChangingDatabase(RuleBasedStateMachine):
     """Adding and removing in any order leaves what building at once would have made."""
 
+    settings = by_length()
+
     def __init__(self):
         super().__init__()
-        self.settings = DatabaseSettings(length_tolerance=TOLERANCE)
         self.database = RelationshipDatabase(self.settings)
         self.model = {}
-        self.query = graph_of([0.5, 1.0, 1.02, 2.5, 4.0])
+        self.query = self.graph(1)
         self.next = 0
-        self.before = database._SMALLEST_RECENT
-        database._SMALLEST_RECENT = 12  # so that merges happen
 
-    def teardown(self):
-        database._SMALLEST_RECENT = self.before
+    @staticmethod
+    def graph(seed):
+        return graph_of(np.random.default_rng(seed).uniform(0.0, 6.0, seed % 13))
 
-    @rule(each=lengths)
-    def add(self, each):
-        self.model[self.next] = graph_of(each)
+    @rule(seed=st.integers(0, 1 << 20))
+    def add(self, seed):
+        self.model[self.next] = self.graph(seed)
         self.database.add(self.next, self.model[self.next])
         self.next += 1
 
@@ -149,7 +153,39 @@ class ChangingDatabase(RuleBasedStateMachine):
         assert len(self.database) == len(self.model)
 
 
+class ChangingLargeDatabase(ChangingDatabase):
+    """The same with so small parts that they are merged, and what is removed stays a while."""
+
+    def __init__(self):
+        super().__init__()
+        self.before = database._SMALLEST_PART
+        database._SMALLEST_PART = 12
+
+    def teardown(self):
+        database._SMALLEST_PART = self.before
+
+
+class ChangingOrientedDatabase(ChangingDatabase):
+    """The same with relations that know more than a length."""
+
+    settings = DatabaseSettings()
+
+    @staticmethod
+    def graph(seed):
+        rng = np.random.default_rng(seed)
+        count = 5 + seed % 4
+        anchors = AnchorPoints(
+            np.round(rng.uniform(-2.0, 2.0, (count, 2))),
+            rng.integers(3, 5, count),
+            np.zeros(count),
+            0.0,
+        )
+        return anchor_graph(anchors, GraphSettings())
+
+
 TestChangingDatabase = ChangingDatabase.TestCase
+TestChangingLargeDatabase = ChangingLargeDatabase.TestCase
+TestChangingOrientedDatabase = ChangingOrientedDatabase.TestCase
 
 
 def test_an_identifier_is_taken_once():
@@ -174,7 +210,7 @@ def test_real_graphs_are_counted_as_plain_counting_does(real_records):
     }
     query = graphs.pop(records[7].index)
     for count_once in (False, True):
-        settings = DatabaseSettings(length_tolerance=TOLERANCE, count_once=count_once)
+        settings = by_length(count_once)
         votes = RelationshipDatabase(settings, graphs.items()).votes(query)
         expected = plain_votes(query, graphs, count_once)
         assert [row[:2] for row in as_rows(votes)] == [row[:2] for row in expected]
@@ -183,7 +219,7 @@ def test_real_graphs_are_counted_as_plain_counting_does(real_records):
 def test_searching_goes_on_while_references_come_and_go():
     rng = np.random.default_rng(1)
     fixed = [(k, graph_of(rng.uniform(0, 20, 30))) for k in range(40)]
-    searched = RelationshipDatabase(DatabaseSettings(length_tolerance=TOLERANCE), fixed)
+    searched = RelationshipDatabase(by_length(), fixed)
     query = graph_of(rng.uniform(0, 20, 30))
     expected = {row[0]: row[1] for row in as_rows(searched.votes(query))}
     stop = threading.Event()

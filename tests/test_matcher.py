@@ -93,8 +93,8 @@ def test_a_reference_seen_by_a_turned_sensor_gives_the_turned_answer(seed, turn)
     )
     other = simulate(world, place @ Pose2D(0.2, 0.1, 0.3), SENSOR, np.random.default_rng(seed))
     straight, around = match(other, scan, PAPER)[0], match(other, turned, PAPER)[0]
-    if straight.evaluation < 0.8:
-        return  # nothing found that could be compared
+    if straight.evaluation < 0.8 or straight.quality < 0.1:
+        return  # nothing found that could be compared, or by a single relation among equals
     expected = Pose2D(0.0, 0.0, turn) @ straight.pose_in_reference
     assert around.evaluation > straight.evaluation - 0.1
     assert around.pose_in_reference.distance(expected) < 0.15

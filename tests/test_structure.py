@@ -20,7 +20,8 @@ ROOT = PACKAGE.parents[1]
 # gets its place here; one that fits nowhere is a sign that it does two things.
 ORDER = (
     *("errors", "pose", "scan", "record", "reference", "protocol", "journey", "_jit"),
-    *("angle_function", "segments", "anchors", "graph", "database", "alignment"),
+    *("angle_function", "segments", "anchors", "graph"),
+    *("length_relation", "oriented_relation", "database", "alignment"),
     *("field", "proposal", "verification", "evaluation", "hypothesis", "decision"),
     *("motion", "belief", "settings"),
     *("description", "pairwise", "stitched_map", "matcher"),

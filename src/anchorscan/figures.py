@@ -332,7 +332,7 @@ def _plot_best_votes(axes: Axes, explanation: Explanation, theme: Theme) -> None
         axes,
         votes.quality[rows],
         [f"{row + 1}.  reference {votes.references[row]}" for row in rows],
-        [f"n = {votes.counts[row]}" for row in rows],
+        [f"n = {votes.counts[row]:.3g}" for row in rows],
         [int(votes.references[row]) == answer for row in rows],
         theme,
     )

@@ -37,7 +37,7 @@ class Trace:
         description: What was derived from it (sections 2 to 4).
         pairwise: The search against single references, where that was the method.
         in_map: The search in the stitched map, where that was the method.
-        references: Those that the hypotheses name.
+        references: Those that the hypotheses name, and candidates.
         hypotheses: The answer, best first.
         settings: The settings of the run.
     """
@@ -141,9 +141,8 @@ class Matcher:
         hypotheses = [hypothesis for search in searches for hypothesis in search.hypotheses]
         if len(searches) > 1:
             hypotheses.sort(key=lambda each: -each.probability)
-        references = tuple(
-            {each.reference: self._known[each.reference].reference for each in hypotheses}.values()
-        )
+        voted_for = () if singles is None else singles.candidates
+        references = (*(() if in_map is None else in_map.references), *voted_for)
         return Trace(
             scan, description, singles, in_map, references, tuple(hypotheses), self.settings
         )
@@ -188,8 +187,8 @@ class Matcher:
         with self._writing:
             if reference.identifier in self._known:
                 raise ValueError(f"there is a reference {reference.identifier} already")
-            self._known[reference.identifier] = known
             (self._map if self._fits(known) else self._singles).add(known)
+            self._known[reference.identifier] = known
 
     def remove(self, identifier: int) -> None:
         """Remove a reference.

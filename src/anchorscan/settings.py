@@ -59,7 +59,12 @@ _MAP: Mapping[str, Any] = {
 _PAPER: Mapping[str, Any] = {
     "method": "references",
     "anchors": {"smallest_wall": 0.5, "smallest_turn": math.radians(30.0)},
-    "database": {"length_tolerance": 0.06, "count_once": True, "candidates": 5},
+    "database": {
+        "relation": "length",
+        "length_tolerance": 0.06,
+        "count_once": True,
+        "candidates": 5,
+    },
     "alignment": {"length_tolerance": 0.07, "matrix_peaks": 2},
 }
 

@@ -8,8 +8,10 @@ that an answer can name the reference scan that it stands for.
 from __future__ import annotations
 
 import math
+import threading
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,11 +22,12 @@ from .database import RelationshipDatabase, Votes, quality
 from .decision import Decision, covariance, decide
 from .description import Description
 from .evaluation import evaluate_all, stack_outlines
-from .field import LikelihoodField
+from .field import LikelihoodField, Tiles
 from .hypothesis import Hypothesis
 from .pairwise import Known
 from .pose import Pose2D
-from .proposal import Landmarks, Proposals, joined, landmarks, proposals
+from .proposal import Landmarks, Proposals, ProposalSettings, joined, landmarks, proposals
+from .reference import Reference
 from .scan import LaserScan
 from .settings import Settings
 from .verification import Fits, follow, verify
@@ -41,6 +44,7 @@ class MapSearch:
         proposals: Alignments that passed the first check.
         fits: What is left after all sieves, best score first.
         decision: What they are worth.
+        references: Those that the hypotheses name, one for each.
         hypotheses: Best first.
     """
 
@@ -48,7 +52,42 @@ class MapSearch:
     proposals: Proposals
     fits: Fits
     decision: Decision
+    references: tuple[Reference, ...]
     hypotheses: tuple[Hypothesis, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class _Content:
+    """What a search reads, replaced as a whole by a writer.
+
+    Args:
+        known: The references by their identifiers.
+        tiles: The field stitched from them.
+        settings: Of the landmarks.
+    """
+
+    known: dict[int, Known]
+    tiles: Tiles
+    settings: ProposalSettings
+
+    @cached_property
+    def identifiers(self) -> NDArray[np.int64]:
+        """(N,) ascending."""
+        return np.array(sorted(self.known), np.int64)
+
+    @cached_property
+    def poses(self) -> NDArray[np.float64]:
+        """(N, 3) ``T_set_scan`` of the references, in the order of their identifiers."""
+        placed = [_placed(self.known[identifier])[1] for identifier in self.identifiers.tolist()]
+        return np.array([pose.to_array() for pose in placed]).reshape(-1, 3)
+
+    @cached_property
+    def landmarks(self) -> Landmarks:
+        """Those of all references."""
+        known = [self.known[identifier] for identifier in self.identifiers.tolist()]
+        return landmarks(
+            [(each.description.anchors, _placed(each)[1]) for each in known], self.settings
+        )
 
 
 class StitchedMap:
@@ -64,17 +103,15 @@ class StitchedMap:
         self._settings = settings
         self._weights = settings.field.weights()
         self._readings = settings.belief.readings(settings.field)
-        self._known = {each.reference.identifier: each for each in begin}
-        self._relations = {identifier: self._relate(k) for identifier, k in self._known.items()}
-        self._database = RelationshipDatabase(
-            settings.database,
-            ((each.reference.identifier, each.description.graph) for each in begin),
-        )
+        # Made when votes are first asked for: without them all references propose.
+        self._preparing = threading.Lock()
+        self._database: RelationshipDatabase | None = None
+        self._relations: dict[int, tuple[Known, Landmarks]] = {}
         self._field = LikelihoodField(settings.field, (_placed(each) for each in begin))
-        self._changed()
+        self._hold({each.reference.identifier: each for each in begin})
 
     def __len__(self) -> int:
-        return len(self._known)
+        return len(self._content.known)
 
     def add(self, known: Known) -> None:
         """Add a reference that has a pose.
@@ -83,11 +120,11 @@ class StitchedMap:
             ValueError: The identifier is in use.
         """
         identifier = known.reference.identifier
-        self._database.add(identifier, known.description.graph)
-        self._field.add(*_placed(known))
-        self._relations[identifier] = self._relate(known)
-        self._known[identifier] = known
-        self._changed()
+        with self._preparing:
+            self._field.add(*_placed(known))  # first, since it may refuse
+            if self._database is not None:
+                self._database.add(identifier, known.description.graph)
+            self._hold({**self._content.known, identifier: known})
 
     def remove(self, identifier: int) -> None:
         """Remove a reference.
@@ -95,12 +132,14 @@ class StitchedMap:
         Raises:
             KeyError: There is no such reference.
         """
-        known = self._known[identifier]
-        self._database.remove(identifier)
-        self._field.remove(*_placed(known))
-        del self._relations[identifier]
-        del self._known[identifier]
-        self._changed()
+        with self._preparing:
+            left = dict(self._content.known)
+            known = left.pop(identifier)
+            if self._database is not None:
+                self._database.remove(identifier)
+            self._relations.pop(identifier, None)
+            self._field.remove(*_placed(known))
+            self._hold(left)
 
     def search(self, description: Description, most: int | None) -> MapSearch:
         """Let relations propose poses, sieve and refine them, and decide.
@@ -109,25 +148,26 @@ class StitchedMap:
             description: Of the scan.
             most: How many references, those of the highest quality, may propose; None for all.
         """
-        settings = self._settings
-        tiles = self._field.tiles
+        settings, content = self._settings, self._content
+        tiles = content.tiles
         points = description.angles.points
-        votes = None if most is None else self._database.votes(description.graph, most)
-        known = self._all() if votes is None else self._some(votes.references)
+        votes = None if most is None else self._voting().votes(description.graph, most)
+        known = content.landmarks if votes is None else self._some(votes.references, content)
         proposed = proposals(description.anchors, points, known, tiles, settings.proposal)
         if not len(proposed.poses):
-            proposed = self._standing()
+            proposed = _standing(content)
         fits = verify(proposed.poses, points, tiles, self._weights, settings.verification)
         decision = decide(fits, settings.decision)
-        hypotheses = self._hypotheses(description, fits, decision)
-        return MapSearch(votes, proposed, fits, decision, hypotheses)
+        hypotheses = self._hypotheses(description, fits, decision, content)
+        references = tuple(content.known[each.reference].reference for each in hypotheses)
+        return MapSearch(votes, proposed, fits, decision, references, hypotheses)
 
     def follow(
         self, scan: LaserScan, poses: NDArray[np.float64], stiffness: NDArray[np.float64]
     ) -> Fits:
         """Refine expected poses of a scan, and score them as the belief does."""
-        settings = self._settings.verification
-        return follow(poses, stiffness, scan.points, self._field.tiles, self._readings, settings)
+        settings, tiles = self._settings.verification, self._content.tiles
+        return follow(poses, stiffness, scan.points, tiles, self._readings, settings)
 
     def nearest(self, poses: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """Return the identifier of the reference taken nearest to each of (K, 3) poses.
@@ -135,17 +175,18 @@ class StitchedMap:
         Returns:
             (K,) identifiers and (K, 3) ``T_reference_laser``.
         """
-        nearest, T_reference_scan = _stand_for(self._poses, poses)
-        return self._identifiers[nearest], T_reference_scan
+        content = self._content
+        nearest, T_reference_scan = _stand_for(content.poses, poses)
+        return content.identifiers[nearest], T_reference_scan
 
     def _hypotheses(
-        self, description: Description, fits: Fits, decision: Decision
+        self, description: Description, fits: Fits, decision: Decision, content: _Content
     ) -> tuple[Hypothesis, ...]:
         """Name for each of the best fits the reference taken nearest, and compare with it."""
         settings = self._settings
         count = min(len(fits), settings.acceptance.hypotheses)
-        nearest, T_reference_scan = _stand_for(self._poses, fits.poses[:count])
-        known = [self._known[identifier] for identifier in self._identifiers[nearest].tolist()]
+        nearest, T_reference_scan = _stand_for(content.poses, fits.poses[:count])
+        known = [content.known[identifier] for identifier in content.identifiers[nearest].tolist()]
         e_m = evaluate_all(
             description.outline,
             stack_outlines([each.description.outline for each in known]),
@@ -169,32 +210,38 @@ class StitchedMap:
             for n, each in enumerate(known)
         )
 
-    def _changed(self) -> None:
-        identifiers = sorted(self._known)
-        self._identifiers = np.array(identifiers, np.int64)
-        poses = [_placed(self._known[identifier])[1].to_array() for identifier in identifiers]
-        self._poses = np.array(poses).reshape(-1, 3)
-        self._landmarks: Landmarks | None = None
+    def _hold(self, known: dict[int, Known]) -> None:
+        self._content = _Content(known, self._field.tiles, self._settings.proposal)
 
-    def _relate(self, known: Known) -> Landmarks:
-        return landmarks([(known.description.anchors, _placed(known)[1])], self._settings.proposal)
+    def _voting(self) -> RelationshipDatabase:
+        with self._preparing:
+            if self._database is None:
+                self._database = RelationshipDatabase(
+                    self._settings.database,
+                    ((k, each.description.graph) for k, each in self._content.known.items()),
+                )
+            return self._database
 
-    def _all(self) -> Landmarks:
-        if self._landmarks is None:
-            known = [self._known[identifier] for identifier in self._identifiers.tolist()]
-            self._landmarks = landmarks(
-                [(each.description.anchors, _placed(each)[1]) for each in known],
-                self._settings.proposal,
-            )
-        return self._landmarks
+    def _some(self, identifiers: NDArray[np.int64], content: _Content) -> Landmarks:
+        """Join the relations of single references, less any removed in between."""
+        known = [content.known.get(identifier) for identifier in identifiers.tolist()]
+        parts = [self._related(each) for each in known if each is not None]
+        return joined(parts) if parts else landmarks([], self._settings.proposal)
 
-    def _some(self, identifiers: NDArray[np.int64]) -> Landmarks:
-        return joined([self._relations[identifier] for identifier in identifiers.tolist()])
+    def _related(self, known: Known) -> Landmarks:
+        identifier = known.reference.identifier
+        made_of, relations = self._relations.get(identifier, (None, None))
+        if relations is None or made_of is not known:
+            anchors = [(known.description.anchors, _placed(known)[1])]
+            relations = landmarks(anchors, self._settings.proposal)
+            self._relations[identifier] = known, relations
+        return relations
 
-    def _standing(self) -> Proposals:
-        """Return the poses of the references: a scan without anchors may stand at any."""
-        poses = np.concatenate([self._poses, self._poses + np.array([0.0, 0.0, math.pi])])
-        return Proposals(poses, np.zeros(len(poses)), len(poses))
+
+def _standing(content: _Content) -> Proposals:
+    """Return the poses of the references: a scan without anchors may stand at any."""
+    poses = np.concatenate([content.poses, content.poses + np.array([0.0, 0.0, math.pi])])
+    return Proposals(poses, np.zeros(len(poses)), len(poses))
 
 
 def _placed(known: Known) -> tuple[LaserScan, Pose2D]:

@@ -1,0 +1,460 @@
+"""Section 4.1 taken further: relations that carry more than a length.
+
+The paper's database knows an edge by its length alone, and every length occurs everywhere:
+among a hundred references the right one hardly stands out.  Here an edge carries what else
+does not depend on where the scan was taken from:
+
+* the kinds of the anchor points at both ends,
+* the edge as a vector in the frame of the main walls, in square cells, instead of its length,
+* the direction of the free space at both ends in the same frame, in eighths of a turn.
+
+The frame of the main walls is known up to quarter turns.  So every edge is turned until it
+lies in the first quadrant, which gives one integer *key*; the quarter turns that this took are
+kept with the edge.  A pair of corresponding edges thereby tells how the two scans are turned
+against each other, as the paper's matching angle histogram does (section 4.2): a reference has
+four counters, one for each quarter turn, and its n_m is the largest.
+
+A correspondence counts with the rarity of its key, ``log(1 + N / df) / log(1 + N)`` for a key
+that occurs ``df`` times among N references, times the share of the cell that lies within the
+tolerance of the new edge; a correspondence near the border of the tolerance counts little
+instead of flipping between one and nothing.  The quality q_m is the paper's.
+
+References with very many edges keep a sample: those whose keys have the smallest hash, so that
+all references keep the same keys, and what two of them have in common is sampled, too.
+
+``docs/scale.md`` has the measurements behind this and behind the defaults.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field
+
+from ._jit import kernel
+from .anchors import AnchorKind
+from .graph import AnchorGraph
+
+__all__ = ["EdgesByKey", "OrientedRelation", "OrientedSettings"]
+
+_KINDS = len(AnchorKind)
+_SECTORS = 8
+_QUARTER = _SECTORS // 4
+# A posting is the slot of a reference and the quarter turns of the edge.
+_TURNS = 4
+_TURN_BITS = 2
+# Tallies are 16-bit integers: a sum of weights that does not depend on their order.
+_FULL = (1 << 16) - 1
+_FINEST_UNIT = 256
+_EXPECTED_TOTAL = 30_000
+# Keys of a part per entry of its table of contents, about.
+_KEYS_PER_ENTRY = 64
+
+
+class OrientedSettings(BaseModel):
+    """Settings of oriented relations."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    cell: float = Field(0.15, ge=0.02, description="width of the cells of edge vectors, metres")
+    position_tolerance: float = Field(
+        0.12, gt=0.0, le=1.0, description="corresponding edge vectors, per axis, metres"
+    )
+    direction_tolerance: float = Field(
+        math.radians(13.5), ge=0.0, description="free space at an anchor to its sector, radians"
+    )
+    shortest_edge: float = Field(0.5, ge=0.0, description="edges that are used, metres")
+    longest_edge: float = Field(25.0, gt=0.0, le=30.0, description="edges that are used, metres")
+    most_edges: int = Field(256, ge=1, description="edges that are kept of one reference")
+    most_votes: int = Field(
+        8_000_000, ge=1, description="database edges looked at; the commonest keys go first"
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class EdgesByKey:
+    """Edges of references in order of their keys; never changed.
+
+    Args:
+        keys: (K,) uint32, ascending.
+        starts: (K + 1,) uint32, where the postings of each key begin.
+        postings: (E,) uint32, slot of the reference and quarter turns, ascending for each key.
+    """
+
+    keys: NDArray[np.uint32]
+    starts: NDArray[np.uint32]
+    postings: NDArray[np.uint32]
+
+    def __post_init__(self) -> None:
+        # A table of contents, so that a look-up touches little of a large part.
+        entries = 1
+        while entries * _KEYS_PER_ENTRY < len(self.keys):
+            entries *= 2
+        shift = (int(self.keys[-1]) if len(self.keys) else 0).bit_length()
+        shift = max(shift - entries.bit_length() + 1, 0)
+        firsts = np.arange(2 * entries + 1, dtype=np.uint64) << np.uint64(shift)
+        contents = np.searchsorted(self.keys, firsts).astype(np.uint32)
+        object.__setattr__(self, "_shift", shift)
+        object.__setattr__(self, "_contents", contents)
+
+    @classmethod
+    def of(cls, keys: NDArray[np.uint32], postings: NDArray[np.uint32]) -> EdgesByKey:
+        """Order (E,) keys and their postings."""
+        rows = keys.astype(np.uint64) << np.uint64(32)
+        rows |= postings
+        rows.sort()
+        ordered = (rows >> np.uint64(32)).astype(np.uint32)
+        begins = np.flatnonzero(np.diff(ordered, prepend=ordered[:1] + np.uint32(1)))
+        return cls(
+            ordered[begins],
+            np.append(begins, len(ordered)).astype(np.uint32),
+            (rows & np.uint64(0xFFFFFFFF)).astype(np.uint32),
+        )
+
+    def __len__(self) -> int:
+        return len(self.postings)
+
+    def merged(self, other: EdgesByKey) -> EdgesByKey:
+        """Merge the edges of later slots into these."""
+        return EdgesByKey(
+            *_merged(
+                self.keys, self.starts, self.postings, other.keys, other.starts, other.postings
+            )
+        )
+
+    def renumbered(self, numbers: NDArray[np.int32]) -> EdgesByKey:
+        """Give slots new numbers; edges of slots whose number is negative are left out."""
+        return EdgesByKey(*_renumbered(self.keys, self.starts, self.postings, numbers))
+
+    def ranges(self, keys: NDArray[np.uint32]) -> NDArray[np.int64]:
+        """(C, 2) where the postings of each of (C,) keys begin and end."""
+        found: NDArray[np.int64] = _ranges(
+            keys,
+            self.keys,
+            self.starts,
+            self._contents,  # type: ignore[attr-defined]
+            self._shift,  # type: ignore[attr-defined]
+        )
+        return found
+
+
+class OrientedRelation:
+    """Edges correspond by vector, kinds and directions.
+
+    Args:
+        settings: Of these.
+    """
+
+    def __init__(self, settings: OrientedSettings) -> None:
+        self._settings = settings
+        self._limits = (
+            settings.shortest_edge,
+            settings.longest_edge,
+            settings.cell,
+            math.ceil((settings.longest_edge + settings.position_tolerance) / settings.cell) + 1,
+        )
+        self._scratch = threading.local()
+
+    def edges(
+        self, graphs: Sequence[AnchorGraph], first: int
+    ) -> tuple[EdgesByKey, NDArray[np.int32]]:
+        """Order the edges of references in slots from ``first`` on, and count them for each."""
+        keys, postings = [_NOTHING], [_NOTHING]
+        for slot, graph in enumerate(graphs, first):
+            of_graph, turns = _keys(_anchors(graph), self._limits, self._settings.most_edges)
+            keys.append(of_graph)
+            postings.append(np.uint32(slot << _TURN_BITS) | turns)
+        sizes = np.array([len(each) for each in keys[1:]], np.int32)
+        return EdgesByKey.of(np.concatenate(keys), np.concatenate(postings)), sizes
+
+    def size(self, graph: AnchorGraph) -> int:
+        """Return the number of edges of a graph that are used."""
+        settings = self._settings
+        lengths = graph.lengths
+        return int(((lengths >= settings.shortest_edge) & (lengths <= settings.longest_edge)).sum())
+
+    def counts(
+        self, graph: AnchorGraph, parts: Sequence[EdgesByKey], used: int, alive: int
+    ) -> NDArray[np.float32]:
+        """Count the corresponding edges of every slot, by rarity: n_m.
+
+        Args:
+            graph: Of the scan that is looked for.
+            parts: Edges of the references.
+            used: Slots in use.
+            alive: References among them that count.
+
+        Returns:
+            (used,) n_m; valid until this thread counts again.
+        """
+        settings = self._settings
+        tolerances = (
+            settings.position_tolerance,
+            settings.direction_tolerance * _SECTORS / (2.0 * math.pi),
+        )
+        keys, turns, shares = _cells(_anchors(graph), self._limits, tolerances)
+        ranges = [part.ranges(keys) for part in parts]
+        found = sum((each[:, 1] - each[:, 0] for each in ranges), np.zeros(len(keys), np.int64))
+        unit = min(_FINEST_UNIT, max(1, _EXPECTED_TOTAL // max(self.size(graph), 1)))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            rarity = np.log1p(alive / found) / math.log1p(max(alive, 1))
+        rarity[found == 0] = 0.0
+        rarity[self._too_common(found)] = 0.0
+        weights = np.round(rarity * shares * unit).astype(np.uint16)
+        tallies, counts = self._scratch_of(used)
+        for part, of_part in zip(parts, ranges, strict=True):
+            _vote(part.postings, of_part, turns, weights, tallies)
+        _strength(tallies, 1.0 / unit, counts)
+        return counts
+
+    def _too_common(self, found: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Mark the commonest keys where all together are more than may be looked at."""
+        most = self._settings.most_votes
+        if int(found.sum()) <= most:
+            return np.zeros(len(found), np.bool_)
+        ordered = np.sort(found)
+        within = int(np.searchsorted(np.cumsum(ordered), most, side="right"))
+        return np.asarray(found >= ordered[within])
+
+    def _scratch_of(self, used: int) -> tuple[NDArray[np.uint16], NDArray[np.float32]]:
+        """Return zeroed tallies of this thread, so that a query allocates none."""
+        counts = getattr(self._scratch, "counts", None)
+        if counts is None or len(counts) < used:
+            counts = np.empty(max(2 * used, 64), np.float32)
+            self._scratch.counts = counts
+            self._scratch.tallies = np.empty(_TURNS * len(counts), np.uint16)
+        tallies = self._scratch.tallies[: _TURNS * used]
+        tallies.fill(0)
+        return tallies, counts[:used]
+
+
+_NOTHING = np.empty(0, np.uint32)
+
+
+def _anchors(
+    graph: AnchorGraph,
+) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.float64], float]:
+    """Anchor points as kernels take them; without a main angle the scan's own frame."""
+    anchors = graph.anchors
+    main = anchors.main_angle if math.isfinite(anchors.main_angle) else 0.0
+    return anchors.positions, anchors.kinds, anchors.directions, main
+
+
+@kernel
+def _folded(pair, sector_a, sector_b, i, j, side):  # type: ignore[no-untyped-def]
+    """Key of a cell turned into the first quadrant, and the quarter turns that this took."""
+    turns = 0
+    while i < 0 or j < 0:
+        i, j = j, -1 - i
+        sector_a -= _QUARTER
+        sector_b -= _QUARTER
+        turns += 1
+    sectors = (sector_a % _SECTORS) * _SECTORS + sector_b % _SECTORS
+    return ((pair * _SECTORS * _SECTORS + sectors) * side + i) * side + j, turns
+
+
+@kernel
+def _floor(value):  # type: ignore[no-untyped-def]
+    return int(math.floor(value))
+
+
+@kernel
+def _scrambled(key):  # type: ignore[no-untyped-def]
+    """A hash of 32 bits, different for different keys."""
+    mask = np.uint64(0xFFFFFFFF)
+    h = np.uint64(key)
+    h = ((h ^ (h >> np.uint64(16))) * np.uint64(0x7FEB352D)) & mask
+    h = ((h ^ (h >> np.uint64(15))) * np.uint64(0x846CA68B)) & mask
+    return h ^ (h >> np.uint64(16))
+
+
+@kernel
+def _keys(anchors, limits, most):  # type: ignore[no-untyped-def]
+    """Distinct keys and quarter turns of a graph's edges: those of the smallest hash."""
+    positions, kinds, directions, main = anchors
+    shortest, longest, cell, side = limits
+    c, s = math.cos(main), math.sin(main)
+    count = len(kinds)
+    keys = np.empty(count * (count - 1) // 2, np.uint32)
+    order = np.empty(len(keys), np.uint64)
+    found = 0
+    for n in range(count):
+        for m in range(n + 1, count):
+            a, b = (n, m) if kinds[n] <= kinds[m] else (m, n)
+            dx, dy = positions[b, 0] - positions[a, 0], positions[b, 1] - positions[a, 1]
+            if not shortest * shortest <= dx * dx + dy * dy <= longest * longest:
+                continue
+            key, turns = _folded(
+                kinds[a] * _KINDS + kinds[b],
+                _floor((directions[a] - main) * _SECTORS / (2.0 * math.pi) + 0.5),
+                _floor((directions[b] - main) * _SECTORS / (2.0 * math.pi) + 0.5),
+                _floor((c * dx + s * dy) / cell),
+                _floor((c * dy - s * dx) / cell),
+                side,
+            )
+            keys[found] = key
+            low = np.uint64(found) << np.uint64(_TURN_BITS) | np.uint64(turns)
+            order[found] = _scrambled(key) << np.uint64(32) | low
+            found += 1
+    order = np.sort(order[:found])
+    chosen = np.empty(min(found, most), np.uint32)
+    chosen_turns = np.empty(len(chosen), np.uint32)
+    kept = 0
+    had = np.zeros(_TURNS, np.bool_)
+    for e in range(found):
+        if e > 0 and order[e] >> np.uint64(32) != order[e - 1] >> np.uint64(32):
+            had[:] = False
+        turn = order[e] & np.uint64(_TURNS - 1)
+        if had[turn]:
+            continue
+        if kept == len(chosen):
+            break
+        had[turn] = True
+        edge = (order[e] & np.uint64(0xFFFFFFFF)) >> np.uint64(_TURN_BITS)
+        chosen[kept] = keys[edge]
+        chosen_turns[kept] = turn
+        kept += 1
+    return chosen[:kept], chosen_turns[:kept]
+
+
+@kernel
+def _cells(anchors, limits, tolerances):  # type: ignore[no-untyped-def]
+    """Keys within the tolerances of a graph's edges, their turns, and how much of each is.
+
+    Of an edge between anchors of one kind, either end may be the first.
+    """
+    positions, kinds, directions, main = anchors
+    shortest, longest, cell, side = limits
+    near, wide = tolerances
+    c, s = math.cos(main), math.sin(main)
+    count = len(kinds)
+    window = int(2.0 * near / cell) + 2
+    arcs = int(2.0 * wide) + 2
+    room = count * (count - 1) * window * window * arcs * arcs
+    keys = np.empty(room, np.uint32)
+    turned = np.empty(room, np.uint8)
+    shares = np.empty(room, np.float32)
+    full = min(cell, 2.0 * near)
+    found = 0
+    for a in range(count):
+        for b in range(count):
+            dx, dy = positions[b, 0] - positions[a, 0], positions[b, 1] - positions[a, 1]
+            if a == b or kinds[a] > kinds[b]:
+                continue
+            if not shortest * shortest <= dx * dx + dy * dy <= longest * longest:
+                continue
+            x, y = c * dx + s * dy, c * dy - s * dx
+            at_a = (directions[a] - main) * _SECTORS / (2.0 * math.pi) + 0.5
+            at_b = (directions[b] - main) * _SECTORS / (2.0 * math.pi) + 0.5
+            for i in range(_floor((x - near) / cell), _floor((x + near) / cell) + 1):
+                in_x = min((i + 1) * cell, x + near) - max(i * cell, x - near)
+                for j in range(_floor((y - near) / cell), _floor((y + near) / cell) + 1):
+                    in_y = min((j + 1) * cell, y + near) - max(j * cell, y - near)
+                    for p in range(_floor(at_a - wide), _floor(at_a + wide) + 1):
+                        for q in range(_floor(at_b - wide), _floor(at_b + wide) + 1):
+                            key, turns = _folded(kinds[a] * _KINDS + kinds[b], p, q, i, j, side)
+                            keys[found] = key
+                            turned[found] = turns
+                            shares[found] = in_x * in_y / (full * full)
+                            found += 1
+    return keys[:found], turned[:found], shares[:found]
+
+
+@kernel
+def _ranges(wanted, keys, starts, contents, shift):  # type: ignore[no-untyped-def]
+    """Where the postings of each wanted key begin and end; nowhere, where it does not occur."""
+    ranges = np.zeros((len(wanted), 2), np.int64)
+    for c in range(len(wanted)):
+        entry = np.int64(wanted[c]) >> shift
+        if entry + 1 >= len(contents):
+            continue
+        low, high = np.int64(contents[entry]), np.int64(contents[entry + 1])
+        while low < high:
+            middle = (low + high) // 2
+            if keys[middle] < wanted[c]:
+                low = middle + 1
+            else:
+                high = middle
+        if low < len(keys) and keys[low] == wanted[c]:
+            ranges[c, 0] = starts[low]
+            ranges[c, 1] = starts[low + 1]
+    return ranges
+
+
+@kernel
+def _vote(postings, ranges, turns, weights, tallies):  # type: ignore[no-untyped-def]
+    """Add weights to the tallies of slots and quarter turns between edge and query."""
+    low = np.uint32(_TURNS - 1)
+    for c in range(len(ranges)):
+        weight = np.uint32(weights[c])
+        if weight == 0:
+            continue
+        turn = np.uint32(turns[c])
+        for e in range(ranges[c, 0], ranges[c, 1]):
+            posting = postings[e]
+            at = (posting & ~low) | ((posting - turn) & low)
+            tallies[at] = min(tallies[at] + weight, np.uint32(_FULL))
+
+
+@kernel
+def _strength(tallies, unit, counts):  # type: ignore[no-untyped-def]
+    """The largest of the four tallies of every slot."""
+    for slot in range(len(counts)):
+        best = tallies[_TURNS * slot]
+        for turn in range(1, _TURNS):
+            best = max(best, tallies[_TURNS * slot + turn])
+        counts[slot] = best * unit
+
+
+@kernel
+def _merged(keys, starts, postings, other_keys, other_starts, other_postings):  # type: ignore[no-untyped-def]
+    """Keys, starts and postings of two parts in one; the other's slots are the later ones."""
+    new_keys = np.empty(len(keys) + len(other_keys), np.uint32)
+    new_starts = np.empty(len(new_keys) + 1, np.uint32)
+    new_postings = np.empty(len(postings) + len(other_postings), np.uint32)
+    a, b, k, e = 0, 0, 0, 0
+    while a < len(keys) or b < len(other_keys):
+        from_a = b == len(other_keys) or (a < len(keys) and keys[a] <= other_keys[b])
+        from_b = a == len(keys) or (b < len(other_keys) and other_keys[b] <= keys[a])
+        new_keys[k] = keys[a] if from_a else other_keys[b]
+        new_starts[k] = e
+        if from_a:
+            for p in range(starts[a], starts[a + 1]):
+                new_postings[e] = postings[p]
+                e += 1
+            a += 1
+        if from_b:
+            for p in range(other_starts[b], other_starts[b + 1]):
+                new_postings[e] = other_postings[p]
+                e += 1
+            b += 1
+        k += 1
+    new_starts[k] = e
+    return new_keys[:k], new_starts[: k + 1], new_postings
+
+
+@kernel
+def _renumbered(keys, starts, postings, numbers):  # type: ignore[no-untyped-def]
+    """Keys, starts and postings with other slot numbers; negative ones are left out."""
+    new_keys = np.empty(len(keys), np.uint32)
+    new_starts = np.empty(len(starts), np.uint32)
+    new_postings = np.empty(len(postings), np.uint32)
+    k, e = 0, 0
+    for a in range(len(keys)):
+        new_keys[k] = keys[a]
+        new_starts[k] = e
+        for p in range(starts[a], starts[a + 1]):
+            number = numbers[postings[p] >> np.uint32(_TURN_BITS)]
+            if number >= 0:
+                turns = postings[p] & np.uint32(_TURNS - 1)
+                new_postings[e] = np.uint32(number) << np.uint32(_TURN_BITS) | turns
+                e += 1
+        if e > new_starts[k]:
+            k += 1
+    new_starts[k] = e
+    return new_keys[:k], new_starts[: k + 1], new_postings[:e]
