@@ -346,6 +346,13 @@ def test_the_share_of_rays_that_pass_through(wall):
     assert passed_through(pose, np.empty((0, 2)), wall, 0.3) == 0.0
 
 
+@pytest.mark.parametrize("length", [1e6, 1e12, 1e300, math.inf])
+def test_a_ray_of_any_length_is_followed_no_farther_than_lasers_see(wall, length):
+    pose = np.array([0.0, 0.5, 0.0])
+    ends = np.array([(1.0, 0.5), (0.0, length)])
+    assert passed_through(pose, ends, wall, 0.3) == (0.5 if math.isfinite(length) else 0.0)
+
+
 def test_a_scan_sees_through_nothing_where_it_was_taken(room):
     scans, field = room
     for scan, pose in scans:

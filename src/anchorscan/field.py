@@ -44,6 +44,8 @@ _FAR = 63  # distance code of "farther than reach"
 _FREE, _SURFACE = 64, 128
 # Farther than this from all surfaces, metres, a ray is clear of them.
 _CLEAR = 0.2
+# A ray is followed no farther, metres: a reading may claim any length.
+_LONGEST_RAY = 100.0
 # A table of so many squares, a quarter of a gigabyte, is for a city.
 _MOST_SQUARES = 1 << 26
 # Hit positions are summed in 256ths of a cell, so that sums stay integers.
@@ -521,7 +523,7 @@ def passed_through(pose, points, tiles, margin):  # type: ignore[no-untyped-def]
         dx = (c * points[i, 0] - s * points[i, 1]) / length
         dy = (s * points[i, 0] + c * points[i, 1]) / length
         last_clear, met = -shortly, -1
-        for k in range(int((length - margin) / tiles.resolution)):
+        for k in range(int((min(length, _LONGEST_RAY) - margin) / tiles.resolution)):
             code = cell_code(tiles, int(x + k * dx), int(y + k * dy))
             if (code & _FAR) >= clear:
                 if met >= 0 and k - met <= shortly:
