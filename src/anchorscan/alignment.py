@@ -44,13 +44,13 @@ __all__ = ["Alignment", "AlignmentSettings", "Correspondences", "align", "corres
 class AlignmentSettings(BaseModel):
     """Settings of the alignment of section 4.2."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     length_tolerance: float = Field(
         0.1, gt=0.0, description="edges correspond when their lengths differ no more, metres"
     )
     histogram_bins: int = Field(
-        90, ge=4, description="bins of the matching angle histogram over 180 degrees"
+        90, ge=4, le=3600, description="bins of the matching angle histogram over 180 degrees"
     )
     turn_tolerance: float = Field(
         math.radians(6.0), gt=0.0, description="largest distance from a histogram peak, radians"

@@ -77,7 +77,7 @@ class AnchorKind(IntEnum):
 class AnchorSettings(BaseModel):
     """Settings of sections 2 and 3, from scan to anchor points."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     angle_function: AngleFunctionSettings = AngleFunctionSettings()
     segments: SegmentSettings = SegmentSettings()
@@ -93,7 +93,7 @@ class AnchorSettings(BaseModel):
     farthest_corner: float = Field(
         0.2, gt=0.0, description="intersection to the readings on either side, metres"
     )
-    histogram_bin: float = Field(0.1, gt=0.0, description="bin of the x- and y-histograms, metres")
+    histogram_bin: float = Field(0.1, ge=0.01, description="bin of the x- and y-histograms, metres")
     smallest_wall: float = Field(0.8, gt=0.0, description="surface that makes a peak, metres")
     most_walls: int = Field(4, ge=0, description="peaks taken of each histogram")
     facing: bool = Field(False, description="tell the two sides of a wall apart")

@@ -43,7 +43,7 @@ CONNECTED, TO_FAR, TO_NEAR, FREE, UNKNOWN = 0, 1, 2, 3, 4
 class AngleFunctionSettings(BaseModel):
     """Settings of section 2."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     baseline: float = Field(0.4, gt=0.0, description="metric distance of a point pair, metres")
     fitted: bool = Field(False, description="fit a line through the readings between the pair")
@@ -53,7 +53,7 @@ class AngleFunctionSettings(BaseModel):
     noise: float = Field(0.05, ge=0.0, description="gap that noise alone can make, metres")
     largest_gap: float = Field(0.5, gt=0.0, description="no two readings connect across more")
     smallest_jump: float = Field(0.3, gt=0.0, description="range step that is a jump, metres")
-    bins: int = Field(180, ge=8, description="bins of the angle histogram over 180 degrees")
+    bins: int = Field(180, ge=8, le=3600, description="bins of the angle histogram over 180 degrees")
 
 
 @dataclass(frozen=True, eq=False)

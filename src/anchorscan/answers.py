@@ -11,6 +11,7 @@ import csv
 import gzip
 import json
 import math
+import zlib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import groupby
@@ -28,6 +29,10 @@ from .record import Record
 __all__ = ["Guess", "Run", "ScanAnswer", "read_line", "read_runs"]
 
 _TABLE = "answers.csv"
+_NO_ANSWER = (ValueError, KeyError, TypeError, AttributeError, RecursionError, OverflowError)
+# JSON lines pack to a fifth; a thousandth is a trap.
+_SMALL_TEXT = 1 << 24
+_MOST_FOLDED = 200
 _COLUMNS = ("protocol", "place", "method", "query", "x", "y", "theta", "probability", "seconds")
 
 
@@ -142,9 +147,12 @@ def read_runs(path: Path) -> list[Run]:
         raise LogError("no such file" if table == path else f"there is no {_TABLE} in it", path)
     try:
         text = _text(table)
-    except (OSError, EOFError, UnicodeDecodeError, gzip.BadGzipFile) as error:
+    except (OSError, EOFError, UnicodeDecodeError, zlib.error) as error:
         raise LogError(f"cannot be read: {error}", path) from None
-    runs = _bench_runs(text) if text.startswith("protocol,") else _lines_run(table, text)
+    try:
+        runs = _bench_runs(text) if text.startswith("protocol,") else _lines_run(table, text)
+    except csv.Error as error:
+        raise LogError(f"is no table of bench: {error}", path) from None
     if not any(run.answers for run in runs):
         raise LogError("holds no line of locate or track and no table of bench", path)
     return runs
@@ -152,7 +160,13 @@ def read_runs(path: Path) -> list[Run]:
 
 def _text(path: Path) -> str:
     data = path.read_bytes()
-    return (gzip.decompress(data) if data[:2] == b"\x1f\x8b" else data).decode("utf-8")
+    if data[:2] == b"\x1f\x8b":
+        limit = max(_SMALL_TEXT, _MOST_FOLDED * len(data))
+        with gzip.open(path, "rb") as stream:
+            data = stream.read(limit + 1)
+        if len(data) > limit:
+            raise LogError("unfolds to more than a run does", path)
+    return data.decode("utf-8")
 
 
 # JSON lines
@@ -166,7 +180,7 @@ def read_line(line: str) -> ScanAnswer:
     """
     try:
         return _answer(json.loads(line))
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+    except _NO_ANSWER as error:
         raise ValueError(f"no answer: {type(error).__name__}: {error}") from None
 
 
@@ -259,7 +273,7 @@ def _table_answers(
     for number, row in rows:
         try:
             answers.append(_table_answer(row))
-        except (ValueError, KeyError, TypeError) as error:
+        except _NO_ANSWER as error:
             problems.append((number, f"no answer: {type(error).__name__}: {error}"))
     return answers, problems
 
@@ -280,4 +294,7 @@ def _table_pose(row: Mapping[str, str], prefix: str) -> Pose2D | None:
     values = [row.get(f"{prefix}{name}") for name in ("x", "y", "theta")]
     if not all(values):
         return None
-    return Pose2D(*(float(value) for value in values if value))
+    pose = Pose2D(*(float(value) for value in values if value))
+    if not pose.is_finite():
+        raise ValueError("a pose is not finite")
+    return pose

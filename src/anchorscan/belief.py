@@ -64,7 +64,7 @@ _NEVER = -1e3  # logarithm of a weight that is none, finite so that differences 
 class BeliefSettings(BaseModel):
     """Settings of the belief over time."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     motion: MotionSettings = MotionSettings()
     likelihood: float = Field(6.0, gt=0.0, description="weight of log(1 / (1 - score))")

@@ -50,7 +50,7 @@ Number = TypeVar("Number", np.int32, np.int64)
 class DatabaseSettings(BaseModel):
     """Settings of the preselection of section 4.1."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     relation: Literal["oriented", "length"] = Field(
         "oriented", description="what corresponding edges have in common; the paper's is length"

@@ -49,7 +49,7 @@ _CORRECT_POSITION, _CORRECT_HEADING = 0.5, math.radians(10.0)
 class DecisionSettings(BaseModel):
     """Settings of the decision."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     constant: float = Field(0.46, description="of the logistic function")
     log_margin: float = Field(1.34, description="weight of the logarithm of the margin")

@@ -65,7 +65,7 @@ _HERE = 0.1
 class EvaluationSettings(BaseModel):
     """Settings of the evaluation of section 5."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     tolerance: float = Field(0.05, gt=0.0, description="readings that differ no more agree, metres")
     relative_tolerance: float = Field(
@@ -85,7 +85,7 @@ class AcceptanceSettings(BaseModel):
     to none in it (P4); the curve on freiburg-079 and csail under P1 and P2 with 1, 5 and all.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     threshold: float = Field(0.7, ge=0.0, le=1.0, description="smallest e_m that is accepted")
     even: float = Field(0.5, description="e_m at which a hypothesis is as likely right as wrong")

@@ -28,7 +28,7 @@ __all__ = ["AnchorGraph", "GraphSettings", "GraphStack", "anchor_graph", "stack"
 class GraphSettings(BaseModel):
     """Settings of the anchor graph of section 4."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     minimal_length: float = Field(
         0.0, ge=0.0, description="shorter edges are left out: their direction is noise, metres"

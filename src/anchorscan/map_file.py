@@ -38,7 +38,9 @@ _MODES = ("trinary", "scale", "raw")
 # Below this, 205 is unknown to map_server too: the value that ROS 1 writes.
 _SAVED_FREE_THRESHOLD = 0.196
 _FREE_LEVEL, _UNKNOWN_LEVEL, _OCCUPIED_LEVEL = 254, 205, 0
-_LARGEST_YAML = 1 << 20
+# A map's YAML has a few hundred bytes; PyYAML takes a second for some ten thousand.
+_LARGEST_YAML = 1 << 14
+_MOST_BRACKETS = 64
 _LARGEST_LEVEL = 65535
 _DIGITS = 9
 
@@ -164,6 +166,12 @@ def _parse_yaml(path: Path) -> dict[Any, Any]:
         raise MissingExtraError("reading a map", "maps") from None
     content = _read_bytes(path, _LARGEST_YAML)
     try:
+        # Nested brackets take PyYAML quadratic time.
+        if sum(map(content.count, (b"[", b"{"))) > _MOST_BRACKETS:
+            raise LogError("is not a map's YAML: it has too many brackets", path)
+        # A few aliases of aliases stand for more than any memory holds.
+        if any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(content, yaml.SafeLoader)):
+            raise LogError("is not a map's YAML: it has aliases", path)
         raw = yaml.safe_load(content)
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
@@ -196,7 +204,10 @@ def _number(
 
 def _shown(value: object) -> str:
     """A foreign value, short and on one line."""
-    text = " ".join(str(value).split()) if isinstance(value, str | Exception) else repr(value)
+    try:
+        text = " ".join(str(value).split()) if isinstance(value, str | Exception) else repr(value)
+    except ValueError:  # an integer of too many digits
+        text = f"such a {type(value).__name__}"
     return text if len(text) <= 60 else text[:57] + "..."
 
 

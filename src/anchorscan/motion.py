@@ -23,7 +23,7 @@ __all__ = ["Motion", "MotionSettings", "motion"]
 class MotionSettings(BaseModel):
     """How far odometry can be trusted, and how far a robot gets without it."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     position_deviation: float = Field(0.01, gt=0.0, description="of every step, metres")
     heading_deviation: float = Field(0.005, gt=0.0, description="of every step, radians")

@@ -59,7 +59,7 @@ _KEYS_PER_ENTRY = 64
 class OrientedSettings(BaseModel):
     """Settings of oriented relations."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     cell: float = Field(0.15, ge=0.02, description="width of the cells of edge vectors, metres")
     position_tolerance: float = Field(

@@ -53,7 +53,7 @@ _MOST = 1 << 16
 class ProposalSettings(BaseModel):
     """Settings of the search for alignments in the set's frame."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     shortest_edge: float = Field(0.5, ge=0.0, description="relations that are used, metres")
     longest_edge: float = Field(15.0, gt=0.0, description="relations that are used, metres")

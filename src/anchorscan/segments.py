@@ -23,7 +23,7 @@ __all__ = ["SegmentSettings", "Segments", "segments"]
 class SegmentSettings(BaseModel):
     """Settings of the segmentation step of section 3."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     smallest_extent: float = Field(0.5, ge=0.0, description="way along a large surface, metres")
     fewest_readings: int = Field(4, ge=2, description="returns that make a surface")

@@ -68,6 +68,9 @@ _PAPER: Mapping[str, Any] = {
     "alignment": {"length_tolerance": 0.07, "matrix_peaks": 2},
 }
 
+_LONGEST_SHOWN = 60
+_LARGEST = float(1 << 24)
+
 # What a preset says differently from the defaults of the sections.
 PRESETS: Mapping[str, Mapping[str, Any]] = types.MappingProxyType(
     {
@@ -100,7 +103,7 @@ PRESETS: Mapping[str, Mapping[str, Any]] = types.MappingProxyType(
 class Settings(BaseModel):
     """Settings of every stage, from scan to decision."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     method: Literal["map", "references"] = Field(
         "map", description="search all references as one map, or one by one as the paper does"
@@ -162,9 +165,23 @@ class Settings(BaseModel):
     @classmethod
     def _explain(cls, values: Any, handler: ModelWrapValidatorHandler[Settings]) -> Settings:
         try:
-            return handler(values)
+            settings = handler(values)
         except ValidationError as error:
             raise SettingsError(_explanation(cls, error)) from None
+        if name := _immense(settings):
+            raise SettingsError(f"{name}: is too large a number to be meant")
+        return settings
+
+
+def _immense(model: BaseModel, path: str = "") -> str:
+    """Return the name of the first number that no stage can work with, "" where there is none."""
+    for name, value in model:
+        if isinstance(value, BaseModel):
+            if found := _immense(value, f"{path}{name}."):
+                return found
+        elif isinstance(value, int | float) and abs(value) > _LARGEST:
+            return path + name
+    return ""
 
 
 def _merged(values: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
@@ -186,7 +203,9 @@ def _explanation(model: type[BaseModel], error: ValidationError) -> str:
     section: type[BaseModel] = model
     for part in path[:-1]:
         section = _section(section, part)
-    return f"unknown setting {where!r}{_nearest(path[-1], section.model_fields, path[:-1])}"
+    name = path[-1][:_LONGEST_SHOWN]
+    where = ".".join([*path[:-1], name])
+    return f"unknown setting {where!r}{_nearest(name, section.model_fields, path[:-1])}"
 
 
 def _section(model: type[BaseModel], name: str) -> type[BaseModel]:

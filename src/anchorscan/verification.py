@@ -40,7 +40,7 @@ FEATURES = ("score", "near", "close", "free", "unknown", "through", "off")
 class VerificationSettings(BaseModel):
     """Settings of the sieves between proposals and fits."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     second_readings: int = Field(28, ge=4, description="readings of the second check")
     third_readings: int = Field(80, ge=4, description="readings of the third check")

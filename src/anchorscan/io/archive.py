@@ -9,13 +9,18 @@ import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import IO
 
 from ..errors import LogError
 from .bounded_file import BoundedPath
 
-__all__ = ["BROKEN", "ZIP_MAGIC", "member_names", "open_archive"]
+__all__ = ["BROKEN", "ZIP_MAGIC", "largest_content", "member_names", "open_archive", "open_member"]
 
 ZIP_MAGIC = b"PK\x03\x04"
+
+# Recordings pack to a fifth; a thousandth, which deflate can reach, is a trap.
+_SMALL_CONTENT = 1 << 24
+_MOST_FOLDED = 200
 
 # What gzip, zipfile and their decompressors raise on data that stops or was altered; a
 # RuntimeError is a member that wants a password, or a compression that Python does not have.
@@ -46,6 +51,26 @@ def open_archive(path: Path) -> Iterator[zipfile.ZipFile]:
             raise LogError(f"the zip archive cannot be read: {error}", path) from None
         with archive:
             yield archive
+
+
+def largest_content(packed: int) -> int:
+    """Return to how many bytes at most a compressed file of ``packed`` bytes may unfold."""
+    return max(_SMALL_CONTENT, _MOST_FOLDED * packed)
+
+
+@contextmanager
+def open_member(path: Path, name: str) -> Iterator[IO[bytes]]:
+    """Open a file in a zip archive.
+
+    Raises:
+        LogError: The archive cannot be read, or the file unfolds beyond all measure.
+    """
+    with open_archive(path) as archive:
+        size, limit = archive.getinfo(name).file_size, largest_content(path.stat().st_size)
+        if size > limit:
+            raise LogError(f"{name} unfolds to {size} bytes, more than a recording does", path)
+        with archive.open(name) as stream:
+            yield stream
 
 
 def member_names(path: Path) -> list[str]:

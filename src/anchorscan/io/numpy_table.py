@@ -29,7 +29,7 @@ from ..errors import LogError, ScanError
 from ..pose import Pose2D
 from ..record import Record
 from ..scan import LaserScan
-from .archive import BROKEN, ZIP_MAGIC, member_names, open_archive
+from .archive import BROKEN, ZIP_MAGIC, member_names, open_member
 from .bounded_file import BoundedPath
 from .geometry import RANGE_MAX, ScanGeometry, geometry_of, make_scan, spread
 from .log import Log, Report
@@ -40,6 +40,7 @@ _MAGIC = b"\x93NUMPY"
 _POSE_LENGTH = 3
 _DIMENSIONS = 2
 _CHUNK = 1 << 20
+_MOST_READINGS = 1 << 20
 _SIDE_ARRAYS = (
     "poses",
     "odometry",
@@ -95,6 +96,8 @@ class NumpyLog(Log):
         rows = header.shape[0] if len(header.shape) > 1 else 1
         if not 1 <= len(header.shape) <= _DIMENSIONS or min(header.shape) < 1:
             raise LogError(f"ranges must be (scans, readings), not {header.shape}", path)
+        if header.shape[-1] > _MOST_READINGS:
+            raise LogError(f"ranges promise {header.shape[-1]} readings a scan", path)
         self.count = rows
         self._sides = self._read_sides(rows) if self._is_archive else {}
         if not any(record.scan is not None for record in self):
@@ -213,12 +216,12 @@ class NumpyLog(Log):
                 with BoundedPath(self.path).open("rb") as stream:
                     yield stream
                 return
-            with open_archive(self.path) as archive:
-                if f"{name}.npy" not in archive.namelist():
-                    held = ", ".join(sorted(archive.namelist())[:8]) or "nothing"
-                    raise LogError(f"no array named {name!r}; it holds {held}", self.path)
-                with archive.open(f"{name}.npy") as member:
-                    yield member
+            held = member_names(self.path)
+            if f"{name}.npy" not in held:
+                listed = ", ".join(sorted(held)[:8]) or "nothing"
+                raise LogError(f"no array named {name!r}; it holds {listed}", self.path)
+            with open_member(self.path, f"{name}.npy") as member:
+                yield member
         except BROKEN as error:
             raise LogError(f"cannot be read: {error}", self.path) from None
 

@@ -7,6 +7,7 @@ Nothing here holds more than one line, and no line longer than `_LONGEST_LINE`.
 from __future__ import annotations
 
 import gzip
+import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -14,7 +15,7 @@ from pathlib import Path, PurePosixPath
 from typing import IO, cast
 
 from ..errors import LogError
-from .archive import BROKEN, ZIP_MAGIC, member_names, open_archive
+from .archive import BROKEN, ZIP_MAGIC, largest_content, member_names, open_member
 from .log import Report
 
 __all__ = ["TextFile", "find_text", "shown"]
@@ -64,7 +65,7 @@ class TextFile:
         """
         try:
             if self.compression == "zip":
-                with open_archive(self.path) as archive, archive.open(self.member) as stream:
+                with open_member(self.path, self.member) as stream:
                     yield stream
             elif self.compression == "gzip":
                 with gzip.open(self.path, "rb") as stream:
@@ -90,22 +91,30 @@ class TextFile:
     def lines(self, report: Report) -> Iterator[tuple[int, bytes]]:
         """Yield the number, from one, and the bytes of every line that is not empty.
 
-        A file that is cut off ends with a report instead of an error; so does every line
-        that is too long to be one.
+        A file that is cut off, or that unfolds beyond all measure, ends with a report instead
+        of an error; so does every line that is too long to be one.
         """
         number = 0
         with self.open() as stream:
+            left = largest_content(self.path.stat().st_size) if self.compression else math.inf
             while True:
                 number += 1
                 try:
                     line = stream.readline(_LONGEST_LINE)
+                    left -= len(line)
                     if len(line) == _LONGEST_LINE:
                         report(number, "the line is too long to be a scan")
-                        while len(stream.readline(_LONGEST_LINE)) == _LONGEST_LINE:
-                            pass
-                        continue
+                        while len(rest := stream.readline(_LONGEST_LINE)) == _LONGEST_LINE:
+                            left -= len(rest)
+                            if left < 0:
+                                break
+                        else:
+                            continue
                 except BROKEN as error:
                     report(number, f"the file is damaged or cut off here: {error}")
+                    return
+                if left < 0:
+                    report(number, "the file unfolds to more than a recording does")
                     return
                 if not line:
                     return

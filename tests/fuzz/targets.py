@@ -1,0 +1,431 @@
+"""What is fuzzed: everything that reads bytes from outside, and the matcher with any scan.
+
+A target takes any bytes.  It may raise the errors of ``errors.py``, each with a message of one
+line; it may skip and count; it must give nothing but sound values, within a second, and with no
+more memory than follows from the size of the input.
+"""
+
+from __future__ import annotations
+
+import functools
+import gc
+import gzip
+import io
+import math
+import resource
+import sqlite3
+import struct
+import time
+import zipfile
+from collections.abc import Callable
+from contextlib import closing
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+
+from anchorscan import (
+    AnchorscanError,
+    LaserScan,
+    Log,
+    LogError,
+    Matcher,
+    Reference,
+    ReferenceSet,
+    ReferenceSetError,
+    ScanError,
+    Settings,
+    SettingsError,
+    load_map,
+    open_log,
+    reference_scans,
+)
+from anchorscan.answers import read_runs
+from anchorscan.set_file import _Header, _seal, _store_header
+
+from . import seeds
+
+__all__ = ["TARGETS", "Target", "execute"]
+
+LONGEST = 1.0
+"""Seconds of processor time that one input may take."""
+
+MEMORY = 64 << 20
+MEMORY_PER_BYTE = 256
+"""Bytes that one input may take: so many, and so many for each of its own."""
+
+_REPEATS = 2
+
+
+class SlowError(Exception):
+    """An input that took too long."""
+
+
+class HungryError(Exception):
+    """An input that took too much memory."""
+
+
+@dataclass(frozen=True)
+class Target:
+    """Something that reads bytes from outside.
+
+    Args:
+        name: What the command calls it.
+        seeds: Gives inputs to begin with.
+        check: Reads an input, in a folder of its own, and says by an exception what is wrong.
+        words: Pieces that mean something there.
+    """
+
+    name: str
+    seeds: Callable[[], list[bytes]]
+    check: Callable[[bytes, Path], None]
+    words: tuple[bytes, ...] = ()
+
+
+def execute(target: Target, data: bytes, folder: Path) -> None:
+    """Give one input to a target, and watch time and memory.
+
+    Raises:
+        SlowError: It took longer than a second of processor time, twice.
+        HungryError: It took more memory than its size allows.
+        Exception: Whatever else the target should not have raised.
+    """
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    spent = math.inf
+    for _ in range(_REPEATS):
+        begin = time.process_time()
+        target.check(data, folder)
+        spent = min(spent, time.process_time() - begin)
+        if spent < LONGEST:
+            break
+        gc.collect()
+    if spent > LONGEST:
+        raise SlowError(f"{len(data)} bytes took {spent:.1f} s")
+    taken = 1024 * (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before)
+    if taken > MEMORY + MEMORY_PER_BYTE * len(data):
+        raise HungryError(f"{len(data)} bytes took {taken >> 20} MB")
+
+
+def _one_line(error: Exception) -> None:
+    message = str(error)
+    assert message and "\n" not in message, f"not one line: {message!r}"
+    assert len(message) < 2000, f"a message of {len(message)} characters"
+
+
+def _check_records(log: Log) -> None:
+    for index, record in enumerate(log):
+        assert record.index == index
+        assert (record.scan is None) == bool(record.problem)
+        assert record.pose is None or record.pose.is_finite()
+        assert record.odometry is None or record.odometry.is_finite()
+        assert record.stamp is None or math.isfinite(record.stamp)
+    for problem in log.problems:
+        assert "\n" not in problem.reason
+        assert problem.line > 0
+
+
+def _check_log(path: Path) -> None:
+    try:
+        _check_records(open_log(path))
+    except LogError as error:
+        _one_line(error)
+
+
+def _log(data: bytes, folder: Path) -> None:
+    path = folder / "log"
+    path.write_bytes(data)
+    _check_log(path)
+
+
+_CLOCK = "PARAM laser_front_laser_resolution 1.0 1.0 host 0\n" + "".join(
+    f"FLASER 3 1 2 3 {i} 0 0 {2 * i} 0 0 {i} host {i}\n" for i in range(3)
+)
+
+
+def _tum(data: bytes, folder: Path) -> None:
+    clock, poses = folder / "clock.log", folder / "poses.tum"
+    if not clock.exists():
+        clock.write_text(_CLOCK, encoding="ascii")
+    poses.write_bytes(data)
+    try:
+        _check_records(open_log(clock, poses=poses, poses_of="laser"))
+    except LogError as error:
+        _one_line(error)
+
+
+def _numpy(data: bytes, folder: Path) -> None:
+    path = folder / "log"
+    members = data.split(seeds.SEPARATOR)
+    if len(members) == 1:
+        path.write_bytes(data)
+    else:
+        with zipfile.ZipFile(path, "w") as archive:
+            for name, content in zip(seeds.NPZ_MEMBERS, members, strict=False):
+                archive.writestr(f"{name}.npy", content)
+    _check_log(path)
+
+
+def _archive(data: bytes, folder: Path) -> None:
+    kind, content = data[:1], data[1:]
+    if kind == b"\1":
+        content = gzip.compress(content, 1)
+    elif kind == b"\2":
+        stream = io.BytesIO()
+        with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
+            archive.writestr("a.log", content)
+        content = stream.getvalue()
+    _log(content, folder)
+
+
+_ENDINGS = {b"#ROSB": ".bag", b"SQLit": ".db3", b"\x89MCAP": ".mcap"}
+
+
+def _bag(data: bytes, folder: Path) -> None:
+    ending = next((e for magic, e in _ENDINGS.items() if data.startswith(magic)), ".bag")
+    path = folder / f"log{ending}"
+    path.write_bytes(data)
+    try:
+        _check_log(path)
+    finally:
+        path.unlink()
+
+
+def _metadata(data: bytes, folder: Path) -> None:
+    home = folder / "rosbag2"
+    home.mkdir(exist_ok=True)
+    storage = home / "run.db3"
+    if not storage.exists():
+        storage.write_bytes(_storage())
+    (home / "metadata.yaml").write_bytes(data)
+    _check_log(home)
+
+
+@functools.cache
+def _storage() -> bytes:
+    return seeds.storage()
+
+
+def _message(data: bytes, folder: Path) -> None:
+    path = folder / "log.db3"
+    if not path.exists():
+        path.write_bytes(_storage())
+    with closing(sqlite3.connect(path)) as connection:
+        connection.execute("PRAGMA journal_mode = MEMORY")
+        connection.execute("PRAGMA synchronous = OFF")
+        connection.execute("UPDATE messages SET data = ?", (data,))
+        connection.commit()
+    _check_log(path)
+
+
+def _check_set(places: ReferenceSet) -> None:
+    last = -1
+    for reference in places.references:
+        assert reference.identifier > last
+        assert reference.pose is None or reference.pose.is_finite()
+        last = reference.identifier
+
+
+def _set(data: bytes, folder: Path) -> None:
+    path = folder / "a.apr"
+    path.write_bytes(data)
+    for ending in ("-wal", "-shm", "-journal"):
+        (folder / f"a.apr{ending}").unlink(missing_ok=True)
+    try:
+        with ReferenceSet.open(path) as places:
+            _check_set(places)
+    except ReferenceSetError as error:
+        _one_line(error)
+
+
+@functools.cache
+def _empty_set() -> bytes:
+    import tempfile
+
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "a.apr"
+        ReferenceSet(path=path).close()
+        return path.read_bytes()
+
+
+def _sealed(data: bytes, folder: Path) -> None:
+    """A file that was crafted with care: every checksum is right, the values are not."""
+    head, name, settings, ranges = (*data.split(seeds.SEPARATOR, 3), *3 * (b"",))[:4]
+    identifier, readings, *numbers = seeds.SEALED.unpack(
+        head[: seeds.SEALED.size].ljust(seeds.SEALED.size, b"\0")
+    )
+    geometry, pose = numbers[:4], numbers[4:]
+    title = name.decode("utf-8", "replace")
+    path = folder / "sealed.apr"
+    path.write_bytes(_empty_set())
+    with closing(sqlite3.connect(path, isolation_level=None)) as connection:
+        connection.execute("PRAGMA journal_mode = OFF")
+        connection.execute("PRAGMA synchronous = OFF")
+        connection.execute("BEGIN")
+        seal = _seal(identifier, readings, *geometry, *pose, title, data=ranges)
+        try:
+            connection.execute("INSERT INTO sensor VALUES (1, ?, ?, ?, ?, ?)", (readings, *geometry))
+            connection.execute(
+                "INSERT INTO reference VALUES (?, 1, ?, ?, ?, ?, ?, ?)",
+                (identifier, *pose, title, seal, ranges),
+            )
+        except (sqlite3.Error, OverflowError):  # NaN is NULL to SQLite, and not allowed there
+            return
+        text = settings.decode("utf-8", "replace")
+        _store_header(connection, _Header(title, text, max(0, identifier + 1), 1, seal))
+        connection.execute("COMMIT")
+    try:
+        with ReferenceSet.open(path) as places:
+            _check_set(places)
+            for hypothesis in places.locate(_rooms()[0].scan):
+                _check_hypothesis(hypothesis)
+    except AnchorscanError as error:
+        _one_line(error)
+
+
+def _directory(data: bytes, folder: Path) -> None:
+    description, table, ranges = (*data.split(seeds.SEPARATOR, 2), b"", b"")[:3]
+    home = folder / "exported"
+    (home / "scans").mkdir(parents=True, exist_ok=True)
+    (home / "set.json").write_bytes(description)
+    (home / "references.csv").write_bytes(table)
+    (home / "scans" / "000000.npy").write_bytes(ranges)
+    try:
+        _check_set(ReferenceSet.import_directory(home))
+    except ReferenceSetError as error:
+        _one_line(error)
+
+
+def _map(data: bytes, folder: Path) -> None:
+    text, image = (*data.split(seeds.SEPARATOR, 1), b"")[:2]
+    path = folder / "m.yaml"
+    path.write_bytes(text)
+    (folder / "m.pgm").write_bytes(image)
+    try:
+        grid = load_map(path)
+    except LogError as error:
+        _one_line(error)
+        return
+    assert grid.resolution > 0.0 and grid.origin.is_finite()
+    assert ((grid.data >= -1) & (grid.data <= 100)).all()
+
+
+def _map_scans(data: bytes, folder: Path) -> None:
+    """The same, and the scans that would be taken there."""
+    text, image = (*data.split(seeds.SEPARATOR, 1), b"")[:2]
+    path = folder / "m.yaml"
+    path.write_bytes(text)
+    (folder / "m.pgm").write_bytes(image)
+    try:
+        for record in islice(reference_scans(load_map(path)), 3):
+            assert record.pose is not None and record.pose.is_finite()
+    except AnchorscanError as error:
+        _one_line(error)
+
+
+def _settings(data: bytes, folder: Path) -> None:
+    try:
+        found = Settings.from_json(data)
+    except SettingsError as error:
+        _one_line(error)
+        return
+    assert Settings.from_json(found.to_json()) == found
+
+
+@functools.cache
+def _rooms() -> list[Reference]:
+    return [Reference(n, scan, pose) for n, (scan, pose) in enumerate(seeds.rooms())]
+
+
+@functools.cache
+def _matcher(preset: str) -> Matcher:
+    return Matcher(_rooms(), Settings.preset(preset))
+
+
+def _check_hypothesis(hypothesis: object) -> None:
+    pose, spread = hypothesis.pose, hypothesis.covariance  # type: ignore[attr-defined]
+    assert pose is None or pose.is_finite()
+    assert hypothesis.pose_in_reference.is_finite()  # type: ignore[attr-defined]
+    assert 0.0 <= hypothesis.probability <= 1.0  # type: ignore[attr-defined]
+    assert np.isfinite(spread).all() and (np.linalg.eigvalsh(spread) > -1e-9).all()
+    assert 0.0 <= hypothesis.evaluation <= 1.0  # type: ignore[attr-defined]
+
+
+def _scan_of(data: bytes) -> LaserScan | None:
+    size = seeds.LIMITS.size
+    limits = seeds.LIMITS.unpack(data[:size].ljust(size, b"\0"))
+    ranges = np.frombuffer(data[size : size + (len(data) - size) // 4 * 4], np.float32)
+    try:
+        return LaserScan(ranges, *limits)
+    except ScanError as error:
+        _one_line(error)
+        return None
+
+
+def _scan(data: bytes, folder: Path) -> None:
+    scan = _scan_of(data)
+    if scan is None:
+        return
+    hypotheses = _matcher("default").locate(scan)
+    assert bool(hypotheses) == bool(scan.is_return.any())
+    for hypothesis in hypotheses:
+        _check_hypothesis(hypothesis)
+
+
+def _scan_paper(data: bytes, folder: Path) -> None:
+    scan = _scan_of(data)
+    if scan is not None:
+        for hypothesis in _matcher("paper").locate(scan):
+            _check_hypothesis(hypothesis)
+
+
+def _answers(data: bytes, folder: Path) -> None:
+    path = folder / "answers"
+    path.write_bytes(data)
+    try:
+        for run in read_runs(path):
+            for answer in run.answers:
+                for guess in answer.guesses:
+                    assert guess.pose is None or guess.pose.is_finite()
+    except LogError as error:
+        _one_line(error)
+
+
+_NUMBERS = (b"1e400", b"nan", b"-inf", b"9" * 30, b"-1", b"0", b"1_0", b"1000000000", b"5e-324")
+_LINES = (b"\n", b"\r\n", b"\r", b"\0", b"\xff", b"\xef\xbb\xbf", b"#", *_NUMBERS)
+_CARMEN = (b"FLASER", b"RLASER", b"ROBOTLASER1", b"PARAM", b"robot_frontlaser_offset", b"ODOM")
+_YAML = (b"&a", b"*a", b"<<: *a", b"!!python/object", b"!!binary", b"[", b"{", b"? ", b"|", b"---")
+_MAP = (b"image", b"m.pgm", b"resolution", b"origin", b"mode", b"raw", b"scale", b"trinary")
+_JSON = (b"{", b"[" * 50, b"null", b"NaN", b"Infinity", b'"method"', b'"field"', b"1e999", b"\\u0000")
+_DOUBLES = tuple(
+    struct.pack("<d", value)
+    for value in (math.nan, math.inf, -math.inf, 1e308, -1e308, 5e-324, 0.0, -0.0, 1e-9, 7.0)
+)
+_FLOATS = tuple(
+    struct.pack("<f", value) for value in (math.nan, math.inf, -math.inf, 3e38, 1e-45, 0.0, -1.0, 80.0)
+)
+
+TARGETS = {
+    target.name: target
+    for target in (
+        Target("carmen", seeds.carmen, _log, _LINES + _CARMEN),
+        Target("g2o", seeds.g2o, _log, (*_LINES, b"VERTEX_SE2", b"EDGE_SE2", b"ROBOTLASER1")),
+        Target("csv", seeds.csv, _log, (*_LINES, b",", b";", b"\t", b"r0", b"ranges[1]", b"x", b"theta")),
+        Target("tum", seeds.tum, _tum, _LINES),
+        Target("numpy", seeds.numpy_files, _numpy, (seeds.SEPARATOR, b"'descr'", b"'|O'", *_NUMBERS)),
+        Target("archive", seeds.archives, _archive, (*_LINES, b"PK\1\2", b"PK\3\4", b"PK\5\6")),
+        Target("answers", seeds.answers, _answers, _JSON),
+        Target("bag", seeds.bags, _bag, (b"op=\2", b"\xff\xff\xff\xff", b"\x89MCAP0\r\n")),
+        Target("bag-metadata", seeds.metadata, _metadata, _YAML),
+        Target("bag-message", seeds.messages, _message, _FLOATS),
+        Target("set", seeds.sets, _set, (b"CREATE", b"TRIGGER", b"SQLite format 3\0")),
+        Target("set-sealed", seeds.sealed, _sealed, (seeds.SEPARATOR, *_DOUBLES, *_FLOATS)),
+        Target("set-directory", seeds.directories, _directory, (seeds.SEPARATOR, *_JSON, *_NUMBERS)),
+        Target("map", seeds.maps, _map, (seeds.SEPARATOR, *_YAML, *_MAP, *_NUMBERS)),
+        Target("map-scans", seeds.maps, _map_scans, (seeds.SEPARATOR, *_MAP, *_NUMBERS)),
+        Target("settings", seeds.settings, _settings, _JSON),
+        Target("scan", seeds.scans, _scan, _DOUBLES + _FLOATS),
+        Target("scan-paper", seeds.scans, _scan_paper, _DOUBLES + _FLOATS),
+    )
+}
+"""By name."""
