@@ -29,7 +29,7 @@ ORDER = (
     *("robot", "robot_parameters", "mailbox"),
     *("explanation", "drawing", "answers"),
     *("sensor", "occupancy", "map_file", "world", "building", "simulator", "exhaustive_search"),
-    *("karto_matcher", "stage_times", "scoreboard"),
+    *("karto_matcher", "monte_carlo", "stage_times", "scoreboard"),
 )
 VALUES = {"errors", "pose", "scan", "record", "reference"}
 # Imported by nobody, but for the command line, which loads them inside its commands.
@@ -42,6 +42,7 @@ LEAVES = {
         "figures",
         "viewer",
         "demo",
+        "lost_robot",
         "map_check",
         "ros_node",
         "cli",

@@ -22,6 +22,13 @@ the way in units of 2 L (the likelihood ratio of an Ornstein-Uhlenbeck process).
 has a *weight*, which collects u along the way, and a *support*, which is of the latest scan
 alone: standing still proves nothing, and a robot that is carried away is doubted at once.
 
+Weights compare places with each other; whether the best of them is any good is another matter.
+A pose that slips off while the robot drives where little is known, or one carried on in a place
+that looks alike, has no rival yet.  So every place keeps its *record*, the mean of u over the
+latest way, and only a place is reported whose record is not bad, neither by itself nor beside
+that of another place.  For the same reason a scan holds a pose only as much as it fits there:
+its information counts with the probability that u stands for.
+
 The constants are fitted on the development logs; the page on the belief says how.
 """
 
@@ -44,6 +51,7 @@ __all__ = [
     "BeliefSettings",
     "Mixture",
     "admitted",
+    "has_stood",
     "log_odds",
     "moved",
     "nothing_known",
@@ -117,6 +125,11 @@ class BeliefSettings(BaseModel):
     mistaken: float = Field(0.1, ge=0.0, le=1.0, description="probability that it was")
     places: int = Field(32, ge=1, description="most places that are kept")
     smallest: float = Field(1e-6, ge=0.0, description="probability of a place worth keeping")
+    record_way: float = Field(0.5, gt=0.0, description="way of a place's record, metres")
+    least_record: float = Field(0.0, description="mean log odds of a place that is reported")
+    rival_record: float = Field(
+        2.5, gt=0.0, description="how much better the record of another place may be"
+    )
     search_spacing: float = Field(
         0.5, ge=0.0, description="way between searches of the whole map while lost, metres"
     )
@@ -144,6 +157,7 @@ class Mixture:
         covariances: (K, 3, 3) of x, y and theta, set's frame.
         weights: (K,) collected along the way.
         support: (K,) log odds of the latest scan.
+        record: (K,) mean log odds over the latest way.
         unsearched: Of anywhere else.
         nowhere: Of what was searched and not found.
     """
@@ -152,6 +166,7 @@ class Mixture:
     covariances: NDArray[np.float64]
     weights: NDArray[np.float64]
     support: NDArray[np.float64]
+    record: NDArray[np.float64]
     unsearched: float = 0.0
     nowhere: float = _NEVER
 
@@ -161,7 +176,7 @@ class Mixture:
 
 def nothing_known() -> Mixture:
     """Return the belief of a robot that was just switched on."""
-    return Mixture(np.empty((0, 3)), np.empty((0, 3, 3)), np.empty(0), np.empty(0))
+    return Mixture(np.empty((0, 3)), np.empty((0, 3, 3)), np.empty(0), np.empty(0), np.empty(0))
 
 
 def moved(mixture: Mixture, step: Motion, settings: BeliefSettings) -> Mixture:
@@ -213,6 +228,7 @@ def admitted(
         covariances=np.concatenate([mixture.covariances, np.repeat(spread[None], count, axis=0)]),
         weights=np.concatenate([mixture.weights, np.full(count, _NEVER)]),
         support=np.concatenate([mixture.support, np.zeros(count)]),
+        record=np.concatenate([mixture.record, np.zeros(count)]),
     ), origin
 
 
@@ -274,9 +290,12 @@ def weighed(
         nowhere = _log_sum(np.array([nowhere, unsearched - total]))
         unsearched = _NEVER
     new = np.where(known, min(4.0 * share, 1.0), 1.0)
+    new = new / (1.0 + np.exp(-odds))
     information = fits.hessians * (new / settings.reading_deviation**2)[:, None, None]
     covariances = _inverses(_inverses(mixture.covariances) + information)
-    return Mixture(fits.poses, covariances, weights, odds, unsearched, nowhere)
+    latest = min(share * settings.way_alike / settings.record_way, 1.0)
+    record = np.where(known, mixture.record + latest * (odds - mixture.record), odds)
+    return Mixture(fits.poses, covariances, weights, odds, record, unsearched, nowhere)
 
 
 def tidied(mixture: Mixture, settings: BeliefSettings) -> Mixture:
@@ -300,6 +319,7 @@ def tidied(mixture: Mixture, settings: BeliefSettings) -> Mixture:
         mixture.covariances[order[good]],
         weights[good] - one,
         support[good],
+        mixture.record[order[good]],
         max(mixture.unsearched - one, _NEVER),
         max(lost - one, _NEVER),
     )
@@ -310,6 +330,13 @@ def probabilities(mixture: Mixture, settings: BeliefSettings) -> NDArray[np.floa
     total = mixture.weights + settings.support * mixture.support
     one = _log_sum(np.append(total, [mixture.unsearched, mixture.nowhere]))
     return np.asarray(np.exp(total - one))
+
+
+def has_stood(mixture: Mixture, place: int, settings: BeliefSettings) -> bool:
+    """Whether the latest scans speak neither against a place nor much more for another one."""
+    record = float(mixture.record[place])
+    beaten = float(mixture.record.max()) - record > settings.rival_record
+    return record >= settings.least_record and not beaten
 
 
 def _log(value: float) -> float:

@@ -55,6 +55,7 @@ __all__ = [
     "Estimate",
     "Method",
     "Task",
+    "default_drives",
     "default_logs",
     "measure",
     "preset_methods",
@@ -83,6 +84,8 @@ _LEFT_OUT = {
 }
 # Corridors that look alike, where no single scan can be sure: measured, but not pooled.
 _LOOK_ALIKE = {"killian"}
+# Drives on which a robot gets lost (P5): with odometry, or so long that made odometry will do.
+_LOST = ("intel-dense", "wean-2", "wean-3", "killian")
 
 _DATA = "../shared/data"
 _SUFFIXES = (".log", ".clf", ".g2o", ".log.gz", ".clf.gz", ".g2o.gz", ".g2o.zip")
@@ -308,23 +311,41 @@ def default_logs(say: Callable[[str], None] = lambda line: None) -> list[Path]:
     Raises:
         AnchorscanError: There are none.
     """
-    folder = Path(os.environ.get("ANCHORSCAN_DATA", _DATA))
-    found = sorted(folder.iterdir()) if folder.is_dir() else []
-    paths = [path for path in found if path.name.endswith(_SUFFIXES)]
+    paths = _logs(say)
     for path in paths:
         if reason := _LEFT_OUT.get(_name(path)):
             say(f"{_name(path)} is left out: {reason}")
-    kept = [path for path in paths if _name(path) not in _LEFT_OUT]
+    return _some([path for path in paths if _name(path) not in _LEFT_OUT])
+
+
+def default_drives(say: Callable[[str], None] = lambda line: None) -> list[Path]:
+    """Find the logs on which P5 is measured, as `default_logs` does.
+
+    Raises:
+        AnchorscanError: There are none.
+    """
+    return _some([path for path in _logs(say) if _name(path) in _LOST])
+
+
+def _logs(say: Callable[[str], None]) -> list[Path]:
+    folder = Path(os.environ.get("ANCHORSCAN_DATA", _DATA))
+    found = sorted(folder.iterdir()) if folder.is_dir() else []
+    kept = [path for path in found if path.name.endswith(_SUFFIXES)]
     package = importlib.util.find_spec("rtbdata")
     if package is not None and package.origin is not None:
         kept += [p for p in (Path(package.origin).parent / "data").glob("killian.g2o.zip")]
     else:
         say("killian is left out: pip install 'anchorscan[bench]' brings it")
-    if not kept:
+    return kept
+
+
+def _some(paths: list[Path]) -> list[Path]:
+    if not paths:
+        folder = Path(os.environ.get("ANCHORSCAN_DATA", _DATA))
         raise AnchorscanError(
             f"no logs in {folder}: name some, or set ANCHORSCAN_DATA to their folder"
         )
-    return kept
+    return paths
 
 
 def read_drives(logs: Iterable[str | Path]) -> list[Drive]:

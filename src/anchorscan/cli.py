@@ -553,7 +553,9 @@ def bench(
     ] = None,
     protocols: Annotated[
         list[str] | None,
-        typer.Option("--protocol", metavar="P1..P4", help="Again for more; all if none is named."),
+        typer.Option(
+            "--protocol", metavar="P1..P5", help="Again for more; P1 to P4 if none is named."
+        ),
     ] = None,
     candidates: Annotated[
         list[Any] | None,
@@ -568,11 +570,16 @@ def bench(
         typer.Option("--output", "-o", metavar="DIR", help="Folder for tables and pictures."),
     ] = None,
     queries: Annotated[
-        int | None, typer.Option(min=1, metavar="N", help="At most so many queries of each split.")
+        int | None,
+        typer.Option(
+            min=1, metavar="N", help="At most so many queries of each split; starts of each drive."
+        ),
     ] = None,
     baselines: Annotated[
         list[str] | None,
-        typer.Option("--baseline", metavar="NAME", help="exhaustive, karto or none; all."),
+        typer.Option(
+            "--baseline", metavar="NAME", help="exhaustive, karto, for P5 amcl, or none; all."
+        ),
     ] = None,
     baseline_queries: Annotated[
         int, typer.Option(min=1, metavar="N", help="The same for the baselines, which are slow.")
@@ -581,10 +588,17 @@ def bench(
 ) -> None:
     """Measure how well and how fast scans are located, by fixed protocols.
 
-    Logs of one building, given one after the other as BUILDING=LOG, are two sessions.
+    Logs of one building, given one after the other as BUILDING=LOG, are two sessions. P5, a lost
+    robot on the move, runs on its own.
     """
     from .benchmark import BASELINES, PROTOCOLS, run
 
+    if protocols and "P5" in protocols:
+        _bench_lost_robot(logs, baselines, queries, baseline_queries, seed, output)
+        protocols = [protocol for protocol in protocols if protocol != "P5"]
+        if not protocols:
+            return
+        baselines = None if baselines is None else [n for n in baselines if n != "amcl"] or ["none"]
     run(
         logs or (),
         presets=presets or ("default",),
@@ -723,6 +737,32 @@ def demo(
 
 
 # Reading
+
+
+def _bench_lost_robot(
+    logs: list[str] | None,
+    baselines: list[str] | None,
+    starts: int | None,
+    baseline_starts: int,
+    seed: int,
+    output: Path | None,
+) -> None:
+    """Measure P5 on the logs that were named, else on those with odometry and on Killian Court."""
+    from .benchmark import default_drives, read_drives
+    from .lost_robot import run
+
+    paths = logs or default_drives(typer.echo)
+    with_baseline = baselines is None or "amcl" in baselines
+    run(
+        read_drives(_progress(paths, "reading", len(paths))),
+        ("anchorscan", "amcl") if with_baseline else ("anchorscan",),
+        starts=starts,
+        baseline_starts=baseline_starts,
+        seed=seed,
+        output_folder=output,
+        say=typer.echo,
+        progress=_progress,
+    )
 
 
 def _reading(

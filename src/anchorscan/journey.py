@@ -13,16 +13,27 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .pose import Pose2D
 from .protocol import Answer
 from .record import Record
 
-__all__ = ["Journey", "Recovery", "RecoveryFigures", "journeys", "odometry", "recovery", "summary"]
+__all__ = [
+    "Journey",
+    "Recovery",
+    "RecoveryFigures",
+    "independent",
+    "journeys",
+    "odometry",
+    "recovery",
+    "summary",
+]
 
 _EVERY = 20
 _APART = 10.0
 _WITHDRAWN = 2.0
+_GAP = 20.0
 
 
 @dataclass(frozen=True)
@@ -77,9 +88,14 @@ class RecoveryFigures:
 
 
 def journeys(
-    records: Sequence[Record], every: int = _EVERY, *, kidnap: bool = False, seed: int = 0
+    records: Sequence[Record],
+    every: int = _EVERY,
+    *,
+    longest: float = math.inf,
+    kidnap: bool = False,
+    seed: int = 0,
 ) -> tuple[Journey, ...]:
-    """Start at every ``every``-th usable record with a pose and drive on to the end.
+    """Start at every ``every``-th usable record with a pose and drive on.
 
     With ``kidnap``, the robot is carried away halfway, to a record at least 10 m from where it
     was, drawn among those that are followed by as many records as it still had before it; these
@@ -88,11 +104,12 @@ def journeys(
     Args:
         records: In time order.
         every: Records between starts.
+        longest: Metres after which a journey ends; by default it goes on to the end of the drive.
         kidnap: Whether there is a jump.
         seed: Draws the places of the jumps.
     """
     usable = [i for i, r in enumerate(records) if r.scan is not None and _has_pose(r)]
-    made = (Journey(tuple(usable[start:])) for start in range(0, len(usable), every))
+    made = (_ended(records, usable[start:], longest) for start in range(0, len(usable), every))
     if not kidnap:
         return tuple(made)
     rng = np.random.default_rng(seed)
@@ -100,12 +117,45 @@ def journeys(
     return tuple(journey for journey in jumped if journey is not None)
 
 
-def odometry(records: Sequence[Record], journey: Journey) -> list[Pose2D]:
+def independent(
+    records: Sequence[Record], journey: Journey, gap: float = _GAP
+) -> tuple[Record, ...]:
+    """Return the records that were taken apart from a journey through the same drive.
+
+    Args:
+        records: In time order.
+        journey: What was fed.
+        gap: Metres of driving before the first and after the last record of each of its parts.
+    """
+    usable = [i for i, r in enumerate(records) if r.scan is not None and _has_pose(r)]
+    along = dict(zip(usable, _driven(records, Journey(tuple(usable))), strict=True))
+    parts = [journey.positions[: journey.jump], journey.positions[journey.jump or 0 :]]
+    spans = [(along[part[0]] - gap, along[part[-1]] + gap) for part in parts if part]
+    return tuple(
+        records[position]
+        for position, metres in along.items()
+        if not any(first < metres < last for first, last in spans)
+    )
+
+
+def odometry(
+    records: Sequence[Record], journey: Journey, noise: float = 0.0, seed: int = 0
+) -> list[Pose2D]:
     """Return ``T_start_laser`` along a journey, as the wheels tell it.
 
     Made from the odometry of the records where all of them have one, else from their poses.
     A kidnapping is no motion.
+
+    Args:
+        records: In time order.
+        journey: What is fed.
+        noise: Share by which distances and turns are off: on the whole journey by one factor
+            each, on every step by another, all normal; and every step's heading is off by so
+            many radians per metre.
+        seed: Draws the noise.
     """
+    rng = np.random.default_rng((seed, *journey.positions[:1]))
+    whole = 1.0 + noise * rng.standard_normal(2)
     along = [records[position] for position in journey.positions]
     poses = [record.odometry for record in along]
     if any(pose is None for pose in poses):
@@ -114,7 +164,7 @@ def odometry(records: Sequence[Record], journey: Journey) -> list[Pose2D]:
     for index, pose in enumerate(poses):
         before = poses[index - 1] if index else None
         if pose is not None and before is not None and index != journey.jump:
-            last = last @ (before.inverse() @ pose)
+            last = last @ _disturbed(before.inverse() @ pose, whole, noise, rng)
         told.append(last)
     return told
 
@@ -167,6 +217,27 @@ def summary(recoveries: Sequence[Recovery]) -> RecoveryFigures:
             else math.nan
         ),
     )
+
+
+def _ended(records: Sequence[Record], positions: Sequence[int], longest: float) -> Journey:
+    journey = Journey(tuple(positions))
+    if math.isinf(longest):
+        return journey
+    within = [metres <= longest for metres in _driven(records, journey)]
+    return Journey(
+        tuple(position for position, near in zip(positions, within, strict=True) if near)
+    )
+
+
+def _disturbed(
+    step: Pose2D, whole: NDArray[np.float64], noise: float, rng: np.random.Generator
+) -> Pose2D:
+    if noise == 0.0:
+        return step
+    longer, further, aside = (noise * rng.standard_normal(3)).tolist()
+    length = float(whole[0]) * (1.0 + longer)
+    turn = step.theta * float(whole[1]) * (1.0 + further) + aside * math.hypot(step.x, step.y)
+    return Pose2D(length * step.x, length * step.y, turn)
 
 
 def _has_pose(record: Record) -> bool:

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from .belief import (
     Mixture,
     admitted,
+    has_stood,
     moved,
     nothing_known,
     probabilities,
@@ -189,7 +190,11 @@ class Localizer:
         order = np.argsort(-worth, kind="stable")[:_NAMED]
         references, T_reference_laser = self._places.nearest(mixture.poses[order])
         within = [held(mixture.covariances[k]) for k in order]
-        accepted = bool(len(order)) and worth[order[0]] * within[0] >= settings.threshold
+        accepted = (
+            bool(len(order))
+            and bool(worth[order[0]] * within[0] >= settings.threshold)
+            and has_stood(mixture, int(order[0]), settings)
+        )
         hypotheses = tuple(
             Hypothesis(
                 reference=int(references[n]),
