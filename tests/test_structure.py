@@ -38,6 +38,7 @@ LEAVES = {
         "ablation",
         "benchmark",
         "calibration",
+        "changed_world",
         "report",
         "figures",
         "viewer",

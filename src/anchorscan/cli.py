@@ -673,6 +673,52 @@ def ablate(
 
 @app.command()
 @_guarded
+def change(
+    logs: Annotated[
+        list[str] | None,
+        typer.Argument(
+            metavar="[BUILDING=]LOG...", help="Logs with poses; those in ANCHORSCAN_DATA if none."
+        ),
+    ] = None,
+    output: Annotated[
+        Path | None,
+        typer.Option("--output", "-o", metavar="DIR", help="Folder for tables and curves."),
+    ] = None,
+    preset: PresetOption = None,
+    settings_file: SettingsOption = None,
+    queries: Annotated[
+        int, typer.Option(min=1, metavar="N", help="At most so many queries of each place.")
+    ] = 100,
+    buildings: Annotated[
+        int, typer.Option(min=0, metavar="N", help="Simulated buildings that are changed.")
+    ] = 4,
+    seed: Annotated[int, typer.Option(min=0, help="Of buildings and changes.")] = 0,
+) -> None:
+    """Change the world after the references were taken, and say what becomes of the answers.
+
+    People before the laser in recorded drives; people, furniture, doors and walls in simulated
+    buildings; from nothing to 60 %.
+    """
+    from . import benchmark, changed_world
+
+    settings = _read_settings(preset or (None if settings_file else "default"), settings_file)
+    assert settings is not None
+    drives = benchmark.read_drives(logs or benchmark.default_logs(_say))
+    cases = [case for case in benchmark.tasks(drives, ("P1", "P3")) if not case.looks_alike]
+    changed_world.run(
+        cases,
+        settings,
+        queries,
+        buildings,
+        seed,
+        output,
+        say=typer.echo,
+        progress=_progress,
+    )
+
+
+@app.command()
+@_guarded
 def check_map(
     map_file: Annotated[Path, typer.Argument(metavar="MAP", help="YAML file of a map.")],
     log: LogArgument,
