@@ -15,7 +15,7 @@ import signal
 import sys
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from enum import Enum
@@ -75,6 +75,14 @@ class PictureFormat(str, Enum):
     png = "png"
     svg = "svg"
     pdf = "pdf"
+
+
+class Endurance(str, Enum):
+    """What is to be endured."""
+
+    day = "day"
+    load = "load"
+    repeat = "repeat"
 
 
 app = typer.Typer(
@@ -683,6 +691,135 @@ def ablate(
     drives = benchmark.read_drives(logs or benchmark.default_logs(_say))
     cases = benchmark.tasks(drives, ("P1", "P2", "P3"))
     ablation.run(cases, settings, queries, typer.echo, chosen)
+
+
+@app.command()
+@_guarded
+def change(
+    logs: Annotated[
+        list[str] | None,
+        typer.Argument(
+            metavar="[BUILDING=]LOG...", help="Logs with poses; those in ANCHORSCAN_DATA if none."
+        ),
+    ] = None,
+    output: Annotated[
+        Path | None,
+        typer.Option("--output", "-o", metavar="DIR", help="Folder for tables and curves."),
+    ] = None,
+    preset: PresetOption = None,
+    settings_file: SettingsOption = None,
+    queries: Annotated[
+        int, typer.Option(min=1, metavar="N", help="At most so many queries of each place.")
+    ] = 100,
+    buildings: Annotated[
+        int, typer.Option(min=0, metavar="N", help="Simulated buildings that are changed.")
+    ] = 4,
+    seed: Annotated[int, typer.Option(min=0, help="Of buildings and changes.")] = 0,
+) -> None:
+    """Change the world after the references were taken, and say what becomes of the answers.
+
+    People before the laser in recorded drives; people, furniture, doors and walls in simulated
+    buildings; from nothing to 60 %.
+    """
+    from . import benchmark, changed_world
+
+    settings = _read_settings(preset or (None if settings_file else "default"), settings_file)
+    assert settings is not None
+    drives = benchmark.read_drives(logs or benchmark.default_logs(_say))
+    cases = [case for case in benchmark.tasks(drives, ("P1", "P3")) if not case.looks_alike]
+    changed_world.run(
+        cases,
+        settings,
+        queries,
+        buildings,
+        seed,
+        output,
+        say=typer.echo,
+        progress=_progress,
+    )
+
+
+@app.command()
+@_guarded
+def endure(
+    what: Annotated[
+        Endurance,
+        typer.Argument(
+            metavar="day|load|repeat",
+            help="day: a day of a robot, and what grows; load: several processes on one set; "
+            "repeat: the same questions under other circumstances.",
+        ),
+    ],
+    logs: Annotated[
+        list[Path] | None,
+        typer.Argument(
+            metavar="[LOG...]",
+            help="Logs with poses in one frame, the first for the references; a simulated "
+            "drive if none.",
+        ),
+    ] = None,
+    hours: Annotated[float, typer.Option(min=0.0, metavar="H", help="Of the robot's day.")] = 24.0,
+    rate: Annotated[float, typer.Option(min=0.1, metavar="HZ", help="Its scans a second.")] = 6.0,
+    seconds: Annotated[
+        float, typer.Option(min=0.0, metavar="S", help="How long each load lasts.")
+    ] = 20.0,
+    queries: Annotated[
+        int, typer.Option(min=1, metavar="N", help="Scans that load and repeat ask.")
+    ] = 100,
+    pythons: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--python",
+            metavar="PYTHON",
+            help="Other interpreters with anchorscan's dependencies, for repeat; again for more.",
+        ),
+    ] = None,
+    preset: PresetOption = None,
+    settings_file: SettingsOption = None,
+) -> None:
+    """Let it run for long, under load, and again: what grows, what waits, what differs."""
+    from tempfile import TemporaryDirectory
+
+    from . import endurance, load, repetition
+    from .protocol import thin
+    from .reference_set import ReferenceSet
+
+    drives = _drives(logs or ())
+    settings = _read_settings(preset, settings_file)
+    with TemporaryDirectory() as folder:
+        set_file = Path(folder) / "set.apr"
+        with ReferenceSet.build(drives[0], settings=settings, path=set_file) as places:
+            if what is Endurance.day:
+                endurance.run(places, drives, hours, rate, typer.echo, _progress)
+        usable = [record.scan for drive in drives for record in drive if record.scan is not None]
+        scans = [usable[index] for index in thin(range(len(usable)), queries)]
+        if what is Endurance.load:
+            load.run(set_file, scans, seconds, typer.echo)
+        if what is Endurance.repeat:
+            asked = ReferenceSet(path=Path(folder) / "scans.apr")
+            asked.add_batch(scans)
+            asked.close()
+            others = [
+                repetition.Circumstance(str(path), {}, python=str(path), exact=False)
+                for path in pythons or ()
+            ]
+            repetition.run(
+                set_file,
+                Path(folder) / "scans.apr",
+                typer.echo,
+                (*repetition.CIRCUMSTANCES, *others),
+            )
+
+
+def _drives(logs: Sequence[Path]) -> list[list[Record]]:
+    """Read logs, or simulate two drives in a building."""
+    if logs:
+        return [list(_records(_open_log(path, {}))) for path in logs]
+    from .building import random_building
+    from .simulator import drive
+
+    world = random_building(0)
+    return [drive(world, seed=seed, length=100.0) for seed in (0, 1)]
 
 
 @app.command()

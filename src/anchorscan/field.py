@@ -385,7 +385,7 @@ def coarse_score(tiles, cx, cy):  # type: ignore[no-untyped-def]
     u = np.uint64(min(max(cx, 0), (tiles.width << 4) - 1))
     v = np.uint64(min(max(cy, 0), (tiles.height << 4) - 1))
     tile = tiles.table[(v >> _4) * np.uint64(tiles.width) + (u >> _4)]
-    return tiles.coarse[(np.uint64(tile) << _8) | ((v & _15) << _4) | (u & _15)]
+    return int(tiles.coarse[(np.uint64(tile) << _8) | ((v & _15) << _4) | (u & _15)])
 
 
 @kernel
