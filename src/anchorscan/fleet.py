@@ -13,6 +13,15 @@ that fits better than the right place does.  The logistic of the decision theref
 every set brought an accident of its own and the margin told nothing; 0 trusts the margin alone.
 ``anchorscan bench-fleet`` measures which is right; what it gave stands on the page "A fleet".
 
+What neither sees: two buildings that are the same, floors of one hotel for instance.  Whichever is
+right, their scores differ only by how each map's grid happens to lie, by ``TWINS`` in the root
+mean square.  So a margin to the best fit of another *building* of that size says nothing: the
+probability is held to at most
+
+    1 - exp(-(m / TWINS)^2 / 2) / 2
+
+and what is held back goes to that rival.
+
 A part of the sets can be searched elsewhere, by a thread or by another machine: ``search`` gives
 values, and ``decide_over`` joins them, in any order of the parts, to the same answer.
 """
@@ -42,10 +51,12 @@ if TYPE_CHECKING:
 
 __all__ = [
     "LOOK_ALIKES",
+    "TWINS",
     "BuildingFits",
     "BuildingHypothesis",
     "Fleet",
     "decide_over",
+    "no_twin",
     "ranked",
     "search",
     "set_files",
@@ -53,6 +64,9 @@ __all__ = [
 
 LOOK_ALIKES = 0.25
 """How fast the odds of an answer fall with the number of sets, beyond what the margin tells."""
+
+TWINS = 0.012
+"""Root mean square of the difference of one scan's scores in two equal buildings."""
 
 _SCORE = FEATURES.index("score")
 _SUFFIX = ".apr"
@@ -212,17 +226,31 @@ def decide_over(
     best, fits = ranked(found)
     harder = settings.constant - look_alikes * math.log(max(sets, 1))
     decision = decide(fits, settings.model_copy(update={"constant": harder}))
+    probabilities = decision.probabilities.tolist()
+    rival = next((k for k, (each, _) in enumerate(best) if each is not best[0][0]), None)
+    if rival is not None:
+        margin = float(fits.features[0, _SCORE] - fits.features[rival, _SCORE])
+        first = min(probabilities[0], no_twin(margin))
+        held_back = probabilities[0] - first
+        probabilities = [min(value, first) for value in probabilities]
+        probabilities[rival] = min(probabilities[rival] + held_back, first)
+    is_answer = probabilities[0] >= settings.threshold
     return [
         BuildingHypothesis(
             each.building,
             replace(
                 each.hypotheses[n],
-                probability=float(decision.probabilities[rank]),
-                accepted=decision.accepted and rank == 0,
+                probability=probabilities[rank],
+                accepted=is_answer and rank == 0,
             ),
         )
         for rank, (each, n) in enumerate(best)
     ]
+
+
+def no_twin(margin: float) -> float:
+    """Return the most that an answer can be worth, by its margin to the best other building."""
+    return 1.0 - 0.5 * math.exp(-0.5 * (margin / TWINS) ** 2)
 
 
 def ranked(found: Sequence[BuildingFits]) -> tuple[list[tuple[BuildingFits, int]], Fits]:

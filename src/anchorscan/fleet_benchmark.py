@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from .building import random_building
 from .decision import DecisionSettings, covariance, evidence, held
 from .errors import AnchorscanError
-from .fleet import LOOK_ALIKES, BuildingFits, ranked, search
+from .fleet import LOOK_ALIKES, TWINS, BuildingFits, Fleet, no_twin, ranked, search
 from .pose import Pose2D
 from .protocol import CORRECT_HEADING, CORRECT_POSITION, recall_at_precision, reliability, thin
 from .reference import Reference
@@ -35,9 +35,10 @@ from .scan import LaserScan
 from .sensor import SensorModel
 from .settings import Settings
 from .simulator import drive, random_poses, simulate
+from .verification import FEATURES
 from .world import World, move_furniture, turn_doors
 
-__all__ = ["Asked", "Case", "Outcome", "fitted", "log_loss", "outcomes", "run", "table"]
+__all__ = ["Asked", "Case", "Outcome", "fitted", "log_loss", "outcomes", "run", "table", "twins"]
 
 Item = TypeVar("Item")
 
@@ -46,6 +47,8 @@ _REFERENCES = 48
 _DRIVE, _SECOND_DRIVE = 60.0, 40.0
 _MOVED, _TURNED = 0.3, 0.3
 _KEPT_FITS = 2
+_SCORE = FEATURES.index("score")
+_TWIN_AT = Pose2D(1000.0, -500.0, 1.0)
 _UNKNOWN_WEIGHT = 0.3
 _TRIED = np.arange(0.0, 2.01, 0.05)
 
@@ -101,6 +104,7 @@ class Outcome:
         is_known: Whether its building was among them.
         evidence: (4,) of the best fit of all.
         held: How likely a pose of its covariance is to be near enough.
+        ceiling: The most that its margin to the best other building lets it be worth.
         is_right_building: Whether that fit is in the right building.
         is_correct: Whether building and pose are right.
         seconds: All searches and the decision.
@@ -111,6 +115,7 @@ class Outcome:
     is_known: bool
     evidence: NDArray[np.float64]
     held: float
+    ceiling: float
     is_right_building: bool
     is_correct: bool
     seconds: float
@@ -152,6 +157,8 @@ def run(
         asked += _simulated_queries(number, seed, queries)
     if not asked:
         raise AnchorscanError("there is no building to ask for")
+    for line in twins(cases, settings, queries, seed) if cases else ():
+        say(line)
     largest = max(sizes) + 1
     shards = _shards(cases, others, settings, seed, max(simulated, largest))
     needed = len(cases) + simulated
@@ -172,6 +179,39 @@ def run(
     for line in table(results, settings.decision):
         say(line)
     return results
+
+
+def twins(cases: Sequence[Case], settings: Settings, queries: int, seed: int = 0) -> Iterator[str]:
+    """Ask every building together with its copy, and tell what comes of it, a line each.
+
+    Args:
+        cases: Real buildings with sets and queries.
+        settings: Of all sets.
+        queries: At most so many of each building.
+        seed: Moves where the steps between queries begin.
+    """
+    squares: list[float] = []
+    accepted = asked = 0
+    for case in cases:
+        places, twin = _set_of(case, Pose2D(), settings), _set_of(case, _TWIN_AT, settings)
+        fleet = Fleet({"one": places, "twin": twin})
+        for scan, _ in _thinned(case, queries, seed):
+            found = [places.locate(scan), twin.locate(scan)]
+            if all(found):
+                squares.append((found[0][0].score - found[1][0].score) ** 2)
+                accepted += fleet.locate(scan)[0].hypothesis.accepted
+                asked += 1
+    yield (
+        f"twins: {asked} scans, scores differ by {math.sqrt(float(np.mean(squares))):.4f} in the "
+        f"root mean square ({TWINS} is shipped); {accepted} answered, half of them wrong"
+    )
+
+
+def _set_of(case: Case, T_set_case: Pose2D, settings: Settings) -> ReferenceSet:
+    places = ReferenceSet(settings=settings)
+    known = [(each.scan, each.pose) for each in case.references if each.pose is not None]
+    places.add_batch([scan for scan, _ in known], [T_set_case @ pose for _, pose in known])
+    return places
 
 
 def outcomes(
@@ -207,8 +247,13 @@ def outcomes(
             found_pose.distance(asked.truth) <= CORRECT_POSITION
             and found_pose.turn(asked.truth) <= CORRECT_HEADING
         )
+        rival = next((k for k, (each, _) in enumerate(best) if each is not best[0][0]), None)
+        scores = fits.features[:, _SCORE]
+        ceiling = 1.0 if rival is None else no_twin(float(scores[0] - scores[rival]))
         seconds += time.perf_counter() - start
-        yield Outcome(asked, size, is_known, speaks, within, right, right and near, seconds)
+        yield Outcome(
+            asked, size, is_known, speaks, within, ceiling, right, right and near, seconds
+        )
 
 
 def probabilities(
@@ -220,7 +265,7 @@ def probabilities(
     speaks -= look_alikes * np.log([each.sets for each in results])
     likely: NDArray[np.float64] = np.array([each.held for each in results])
     likely /= 1.0 + np.exp(-speaks)
-    return likely
+    return np.minimum(likely, [each.ceiling for each in results])
 
 
 def log_loss(results: Sequence[Outcome], look_alikes: float, settings: DecisionSettings) -> float:
@@ -316,12 +361,7 @@ def _shards(
 ) -> Iterator[tuple[str, ReferenceSet]]:
     """Give the sets one after the other, those with queries first."""
     for case in cases:
-        places = ReferenceSet(settings=settings)
-        places.add_batch(
-            [reference.scan for reference in case.references],
-            [reference.pose for reference in case.references],
-        )
-        yield case.place, places
+        yield case.place, _set_of(case, Pose2D(), settings)
     for number in range(count):
         if number == _BEFORE_OTHERS:
             yield from others
