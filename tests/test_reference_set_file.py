@@ -703,3 +703,32 @@ def test_a_hidden_thread_does_not_own_the_file(tmp_path: Path) -> None:
         thread.join()
     places.close()
     assert len(content_of(path)) == 20
+
+
+_READ_AND_WRITE = """
+import sys
+from anchorscan import LaserScan, Pose2D, ReferenceSet
+with ReferenceSet.open(sys.argv[1]) as places:
+    places.add(LaserScan([2.0] * 9, 0.0, 0.1), Pose2D(), "other")
+    print(len(places))
+"""
+
+
+def test_a_writer_that_also_reads_keeps_its_hold_on_the_log(tmp_path: Path) -> None:
+    """Another process that opens, writes and closes must not take the log away from it."""
+    path = tmp_path / "set.apr"
+    scan = LaserScan([1.0] * 9, 0.0, 0.1)
+    with ReferenceSet(path=path) as places:
+        for count in range(3):
+            places.add(scan, Pose2D(), "mine")
+            places.refresh()
+            ReferenceSet.open(path).close()
+            done = subprocess.run(
+                [sys.executable, "-c", _READ_AND_WRITE, str(path)],
+                capture_output=True,
+                text=True,
+                check=True,
+            )
+            assert int(done.stdout) == 2 * count + 2
+    names = [reference.name for reference in ReferenceSet.open(path).references]
+    assert sorted(names) == 3 * ["mine"] + 3 * ["other"]

@@ -10,12 +10,16 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:  # what type checkers and editors see; a test holds it equal to _HOMES
     from .building import random_building as random_building
+    from .client import RemoteSet as RemoteSet
     from .errors import AnchorscanError as AnchorscanError
     from .errors import LogError as LogError
     from .errors import MissingExtraError as MissingExtraError
     from .errors import ReferenceSetError as ReferenceSetError
     from .errors import ScanError as ScanError
+    from .errors import ServiceError as ServiceError
     from .errors import SettingsError as SettingsError
+    from .fleet import BuildingHypothesis as BuildingHypothesis
+    from .fleet import Fleet as Fleet
     from .hypothesis import Hypothesis as Hypothesis
     from .io import Log as Log
     from .io import Problem as Problem
@@ -45,6 +49,8 @@ __version__ = "0.1.0"
 # The public names and the module that holds each: the one list behind __all__.
 _HOMES = {
     "AnchorscanError": "errors",
+    "BuildingHypothesis": "fleet",
+    "Fleet": "fleet",
     "Hypothesis": "hypothesis",
     "LaserScan": "scan",
     "Log": "io",
@@ -58,8 +64,10 @@ _HOMES = {
     "Reference": "reference",
     "ReferenceSet": "reference_set",
     "ReferenceSetError": "errors",
+    "RemoteSet": "client",
     "ScanError": "errors",
     "SensorModel": "sensor",
+    "ServiceError": "errors",
     "Settings": "settings",
     "SettingsError": "errors",
     "Trace": "matcher",

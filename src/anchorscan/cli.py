@@ -31,6 +31,7 @@ from .errors import AnchorscanError, LogError, SettingsError
 
 if TYPE_CHECKING:
     from .answers import ScanAnswer
+    from .fleet import Fleet
     from .hypothesis import Hypothesis
     from .io import Log
     from .pose import Pose2D
@@ -337,6 +338,107 @@ def locate(
 
 @app.command()
 @_guarded
+def which(
+    sets: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="SET... LOG", help="Reference sets, or folders of them; then a log."
+        ),
+    ],
+    output: Annotated[
+        Path | None,
+        typer.Option("--output", "-o", metavar="OUT", help="File for the JSON lines, not stdout."),
+    ] = None,
+    threads: Annotated[
+        int, typer.Option(min=1, metavar="N", help="Share the sets among threads.")
+    ] = 1,
+    field_of_view: FieldOfViewOption = None,
+    range_max: RangeMaxOption = None,
+    topic: TopicOption = None,
+    upside_down: UpsideDownOption = False,
+    preset: PresetOption = None,
+    settings_file: SettingsOption = None,
+) -> None:
+    """Say in which of many buildings every scan of a log was taken, and where in it.
+
+    One JSON object a scan, as of locate; every hypothesis names its building: the file of its set
+    without ".apr". A probability is that the building and the pose are right, among all sets.
+    """
+    from .fleet import Fleet
+
+    *places, log = sets
+    if not places:
+        raise typer.BadParameter("give reference sets, and a log after them")
+    opened = _open_log(log, _reading(field_of_view, range_max, topic, upside_down))
+    fleet = Fleet.open(places, settings=_read_settings(preset, settings_file))
+    fleet.prepare()
+    records: Iterable[Record] = _records(opened)
+    if output is not None or not sys.stdout.isatty():
+        records = _progress(records, "asking", opened.count)
+    accepted: dict[str, int] = {}
+    count = 0
+    with _writing(output) as stream:
+        for record in records:
+            line = _which_line(fleet, record, threads)
+            stream.write(json.dumps(line, allow_nan=False) + "\n")
+            stream.flush()
+            count += 1
+            if line["accepted"]:
+                building = line["hypotheses"][0]["building"]
+                accepted[building] = accepted.get(building, 0) + 1
+    told = ", ".join(f"{number} in {name}" for name, number in sorted(accepted.items()))
+    _say(f"{log}: {count} scans, {len(fleet)} sets: {told or 'none located'}")
+
+
+@app.command()
+@_guarded
+def serve(
+    folder: Annotated[
+        Path, typer.Argument(metavar="FOLDER", help="NAME.apr in it is the set NAME.")
+    ],
+    host: Annotated[
+        str, typer.Option(metavar="ADDRESS", help="Where to listen; others need tokens.")
+    ] = "127.0.0.1",
+    port: Annotated[int, typer.Option(min=1, max=65535, metavar="PORT", help="Port.")] = 8000,
+    workers: Annotated[
+        int, typer.Option(min=1, metavar="N", help="Processes, each with all sets in memory.")
+    ] = 1,
+    tokens: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Lines 'read TOKEN' or 'write TOKEN'; else the variable ANCHORSCAN_TOKENS.",
+        ),
+    ] = None,
+    largest_request: Annotated[
+        int, typer.Option(min=1, metavar="MB", help="Largest request, megabytes.")
+    ] = 64,
+    seconds: Annotated[
+        float, typer.Option(min=0.1, metavar="S", help="Longest time for a request.")
+    ] = 30.0,
+    most_scans: Annotated[
+        int, typer.Option(min=1, metavar="N", help="Most scans or references in a request.")
+    ] = 1000,
+) -> None:
+    """Serve the reference sets of a folder over HTTP, until told to stop.
+
+    The page /docs says what can be asked. Without tokens only this machine is answered.
+    """
+    from .service import ServiceOptions, read_tokens
+    from .service import serve as listen
+
+    options = ServiceOptions(
+        folder,
+        read_tokens(tokens),
+        largest_request=largest_request << 20,
+        seconds=seconds,
+        most_scans=most_scans,
+    )
+    listen(options, host, port, workers, say=_say)
+
+
+@app.command()
+@_guarded
 def track(
     set_file: SetArgument,
     log: LogArgument,
@@ -617,6 +719,56 @@ def bench(
         seed=seed,
         baselines=() if baselines == ["none"] else baselines or BASELINES,
         baseline_queries=baseline_queries,
+        say=typer.echo,
+        progress=_progress,
+    )
+
+
+@app.command()
+@_guarded
+def bench_fleet(
+    logs: Annotated[
+        list[str] | None,
+        typer.Argument(
+            metavar="[BUILDING=]LOG...", help="Logs with poses; those in ANCHORSCAN_DATA if none."
+        ),
+    ] = None,
+    sizes: Annotated[
+        list[int] | None,
+        typer.Option("--sets", min=1, metavar="N", help="Again for more; 1, 10, 100 and 1000."),
+    ] = None,
+    also: Annotated[
+        list[Path] | None,
+        typer.Option("--also", metavar="SET", help="A set that is asked, too; again for more."),
+    ] = None,
+    queries: Annotated[
+        int, typer.Option(min=1, metavar="N", help="At most so many queries of each building.")
+    ] = 20,
+    simulated: Annotated[
+        int, typer.Option(min=0, max=10, metavar="N", help="Simulated buildings with queries.")
+    ] = 10,
+    seed: Annotated[int, typer.Option(help="Of the simulated buildings.")] = 0,
+    preset: PresetOption = None,
+    settings_file: SettingsOption = None,
+) -> None:
+    """Measure how surely a scan names its building, and its place there, among many sets.
+
+    Every log gives a set and queries; simulated buildings fill up to the number of sets.
+    """
+    from . import benchmark, fleet_benchmark
+    from .reference_set import ReferenceSet
+
+    settings = _read_settings(preset or (None if settings_file else "default"), settings_file)
+    assert settings is not None
+    drives = benchmark.read_drives(logs or benchmark.default_logs(_say))
+    fleet_benchmark.run(
+        benchmark.tasks(drives, ("P1", "P3")),
+        [(path.stem, ReferenceSet.open(path, settings=settings)) for path in also or ()],
+        settings,
+        sorted(set(sizes or (1, 10, 100, 1000))),
+        queries,
+        simulated,
+        seed,
         say=typer.echo,
         progress=_progress,
     )
@@ -1078,6 +1230,24 @@ class _Locator:
         if record.scan is None:
             return record.problem
         return "no reading is a return" if len(self._places) else "the set has no references"
+
+
+def _which_line(fleet: Fleet, record: Record, threads: int) -> dict[str, Any]:
+    """Return the line of ``which`` for a record."""
+    start = time.perf_counter()
+    found = [] if record.scan is None else fleet.locate(record.scan, threads)
+    line: dict[str, Any] = {
+        "scan": record.index,
+        "stamp": record.stamp,
+        "seconds": round(time.perf_counter() - start, _DECIMALS + 1),
+        "accepted": bool(found) and found[0].hypothesis.accepted,
+        "hypotheses": [
+            {"building": each.building, **_hypothesis_line(each.hypothesis)} for each in found
+        ],
+    }
+    if not found:
+        line["reason"] = record.problem or "no reading is a return"
+    return line
 
 
 def _tracked(

@@ -10,6 +10,7 @@ __all__ = [
     "MissingExtraError",
     "ReferenceSetError",
     "ScanError",
+    "ServiceError",
     "SettingsError",
 ]
 
@@ -38,6 +39,10 @@ class LogError(AnchorscanError):
 
 class ReferenceSetError(AnchorscanError):
     """A reference set that cannot be opened, read or written."""
+
+
+class ServiceError(AnchorscanError):
+    """A service that cannot be reached, refuses, or answers what is no answer."""
 
 
 class SettingsError(AnchorscanError):

@@ -26,6 +26,7 @@ import secrets
 import sqlite3
 import stat
 import struct
+import threading
 import time
 import weakref
 from collections.abc import Iterable, Iterator, Sequence
@@ -250,11 +251,14 @@ class SetFile:
 
     def __init__(self, path: Path):
         self.path = path
-        _check_file(path)
-        with _told(path):
+        with _opening, _told(path):
+            _check_file(path)
             self._connection = _connect(path, "mode=rw")
+            self._identity = _hold(path)
             # Runs at the end of the process too: a set that nobody closed is one file even so.
-            self._finish = weakref.finalize(self, _abandon, self._connection, path, os.getpid())
+            self._finish = weakref.finalize(
+                self, _abandon, self._connection, path, self._identity, os.getpid()
+            )
             try:
                 _check_schema(self._connection)
                 _patiently(self._connection, "PRAGMA journal_mode = WAL")
@@ -262,6 +266,7 @@ class SetFile:
             except BaseException:
                 self._finish.detach()
                 self._connection.close()
+                _release(self._identity)
                 raise
 
     def append(
@@ -342,7 +347,7 @@ class SetFile:
                 is lost, the next opening tries again.
         """
         if self._finish.detach() is not None:
-            _fold_in(self._connection, self.path)
+            _fold_in(self._connection, self.path, self._identity)
 
     def __enter__(self) -> SetFile:
         return self
@@ -445,10 +450,40 @@ def _check_name(name: str) -> None:
         raise ReferenceSetError(f"a name has at most {LONGEST_NAME} bytes, not {size}")
 
 
+# The files that this process has open to write, with how many times.  POSIX drops all locks of
+# a process on a file when the process closes any handle of it, SQLite's as well; another process
+# would then take itself for the last user and remove the log that this one still writes to.
+_Identity = tuple[int, int]
+_held: dict[_Identity, int] = {}
+_opening = threading.RLock()
+
+
+def _hold(path: Path) -> _Identity:
+    found = path.stat()
+    identity = (found.st_dev, found.st_ino)
+    _held[identity] = _held.get(identity, 0) + 1
+    return identity
+
+
+def _release(identity: _Identity) -> None:
+    with _opening:
+        _held[identity] -= 1
+        if not _held[identity]:
+            del _held[identity]
+
+
 def _check_file(path: Path) -> None:
     """Tell a reference set from everything else by its first bytes alone."""
+    with _opening:
+        _check_header(path)
+
+
+def _check_header(path: Path) -> None:
     try:
-        kind = path.stat().st_mode
+        found = path.stat()
+        if (found.st_dev, found.st_ino) in _held:
+            return  # it was looked at when it was opened, and must not be closed now
+        kind = found.st_mode
         if stat.S_ISDIR(kind):
             raise ReferenceSetError(f"{path}: is a directory, not a reference set")
         if not stat.S_ISREG(kind):
@@ -574,14 +609,14 @@ def _patiently(connection: sqlite3.Connection, statement: str) -> None:
         time.sleep(_PAUSE)
 
 
-def _abandon(connection: sqlite3.Connection, path: Path, process: int) -> None:
+def _abandon(connection: sqlite3.Connection, path: Path, identity: _Identity, process: int) -> None:
     """Close as well as it goes where nobody is left to be told."""
     if os.getpid() == process:  # in a forked copy the connection is the parent's
         with suppress(Exception):
-            _fold_in(connection, path)
+            _fold_in(connection, path, identity)
 
 
-def _fold_in(connection: sqlite3.Connection, path: Path) -> None:
+def _fold_in(connection: sqlite3.Connection, path: Path, identity: _Identity) -> None:
     """Bring the write-ahead log into the file, leave that mode, and close."""
     try:
         connection.execute(f"PRAGMA busy_timeout = {int(1000 * _CLOSING_PATIENCE)}")
@@ -596,6 +631,7 @@ def _fold_in(connection: sqlite3.Connection, path: Path) -> None:
             ) from error
     finally:
         connection.close()
+        _release(identity)
 
 
 def _publish(draft: Path, path: Path) -> None:

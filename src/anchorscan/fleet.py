@@ -1,0 +1,305 @@
+"""Which building is this?  One scan asked of many sets, and one decision over all of them.
+
+Section 1 of the paper asks where a robot is in one building.  A fleet knows many, and a robot that
+was just switched on may be in any.  Every set is searched by itself, and what is left of the fits
+of all sets is put in one order and decided **once** (see ``decision.py``): the rival that the
+best fit must beat is then the best fit at any other place of any building.  A thousand
+buildings hold more look-alikes than one, so the margin to that rival shrinks by itself, and
+with it the probability.
+
+What the margin does not see: a set that does not hold the place is one more chance for an accident
+that fits better than the right place does.  The logistic of the decision therefore loses
+``look_alikes * log(N)`` with N sets: with ``look_alikes`` = 1 the odds would fall as 1 / N, as if
+every set brought an accident of its own and the margin told nothing; 0 trusts the margin alone.
+``anchorscan bench-fleet`` measures which is right; what it gave stands on the page "A fleet".
+
+What neither sees: two buildings that are the same, floors of one hotel for instance.  Whichever is
+right, their scores differ only by how each map's grid happens to lie, by ``TWINS`` in the root
+mean square.  So a margin to the best fit of another *building* of that size says nothing: the
+probability is held to at most
+
+    1 - exp(-(m / TWINS)^2 / 2) / 2
+
+and what is held back goes to that rival.
+
+A part of the sets can be searched elsewhere, by a thread or by another machine: ``search`` gives
+values, and ``decide_over`` joins them, in any order of the parts, to the same answer.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from itertools import chain
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from .decision import DecisionSettings, decide
+from .errors import ReferenceSetError, SettingsError
+from .hypothesis import Hypothesis
+from .reference_set import ReferenceSet
+from .scan import LaserScan
+from .verification import FEATURES, Fits
+
+if TYPE_CHECKING:
+    from .settings import Settings
+
+__all__ = [
+    "LOOK_ALIKES",
+    "TWINS",
+    "BuildingFits",
+    "BuildingHypothesis",
+    "Fleet",
+    "decide_over",
+    "no_twin",
+    "ranked",
+    "search",
+    "set_files",
+]
+
+LOOK_ALIKES = 0.25
+"""How fast the odds of an answer fall with the number of sets, beyond what the margin tells."""
+
+TWINS = 0.012
+"""Root mean square of the difference of one scan's scores in two equal buildings."""
+
+_SCORE = FEATURES.index("score")
+_SUFFIX = ".apr"
+
+
+@dataclass(frozen=True, eq=False)
+class BuildingFits:
+    """What the search of one set found.
+
+    Args:
+        building: Name of the set.
+        fits: Best score first, as many as there are hypotheses.
+        hypotheses: One for every fit; their probabilities know of this set alone.
+    """
+
+    building: str
+    fits: Fits
+    hypotheses: tuple[Hypothesis, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class BuildingHypothesis:
+    """One possible place of a scan among all buildings.
+
+    Args:
+        building: Name of the set.
+        hypothesis: The place in that set; ``probability`` and ``accepted`` know of all sets.
+    """
+
+    building: str
+    hypothesis: Hypothesis
+
+
+class Fleet:
+    """Named reference sets that are asked together.
+
+    Args:
+        sets: By name; all with poses in every reference, and with the same settings, since
+            scores of different settings cannot be compared.
+
+    Raises:
+        ReferenceSetError: A set has references without a pose, or there is no set.
+        SettingsError: Two sets have different settings.
+    """
+
+    def __init__(self, sets: Mapping[str, ReferenceSet]) -> None:
+        self._sets = dict(sets)
+        if not self._sets:
+            raise ReferenceSetError("a fleet needs a set")
+        first = next(iter(self._sets))
+        self.settings: Settings = self._sets[first].settings
+        if self.settings.method != "map":
+            raise SettingsError("many sets are asked together by the method 'map' only")
+        for name, places in self._sets.items():
+            if places.settings != self.settings:
+                raise SettingsError(
+                    f"the sets {first} and {name} have different settings: "
+                    "give the same to all, for instance by a preset"
+                )
+            if any(reference.pose is None for reference in places.references):
+                raise ReferenceSetError(
+                    f"{name}: has references without a pose, which have no common map to ask"
+                )
+
+    @classmethod
+    def open(
+        cls, paths: Iterable[str | os.PathLike[str]], *, settings: Settings | None = None
+    ) -> Fleet:
+        """Open sets, each named by its file without ``.apr``; of a folder, all of its sets.
+
+        Args:
+            paths: Files and folders.
+            settings: Settings to use instead of those in the files.
+
+        Raises:
+            ReferenceSetError: A set cannot be opened, two have the same name, or a folder has
+                none.
+            SettingsError: Two sets have different settings.
+        """
+        sets: dict[str, ReferenceSet] = {}
+        for path in set_files(paths):
+            name = path.name.removesuffix(_SUFFIX)
+            if name in sets:
+                raise ReferenceSetError(f"{path}: there is another set with the name {name}")
+            sets[name] = ReferenceSet.open(path, settings=settings)
+        return cls(sets)
+
+    def __len__(self) -> int:
+        return len(self._sets)
+
+    @property
+    def sets(self) -> dict[str, ReferenceSet]:
+        """The sets by name."""
+        return dict(self._sets)
+
+    def prepare(self) -> None:
+        """Do now what the first query would wait for: derive every index, compile kernels."""
+        for number, places in enumerate(self._sets.values()):
+            if not number:
+                places.prepare()
+            places.nearest(np.zeros((1, 3)))  # derives the index of this set
+
+    def locate(self, scan: LaserScan, threads: int = 1) -> list[BuildingHypothesis]:
+        """Find in which building, and where in it, a scan may have been taken.
+
+        Args:
+            scan: From any sensor, in the frame of its laser.
+            threads: How many threads share the sets.
+
+        Returns:
+            Hypotheses of all buildings, best first; none only for an unusable scan or from
+            empty sets.
+        """
+        items = list(self._sets.items())
+        if threads <= 1:
+            found = list(search(items, scan))
+        else:
+            with ThreadPoolExecutor(threads) as pool:
+                parts = pool.map(lambda part: list(search(part, scan)), _shares(items, threads))
+                found = list(chain.from_iterable(parts))
+        return decide_over(found, len(self), self.settings.decision)
+
+
+def search(sets: Iterable[tuple[str, ReferenceSet]], scan: LaserScan) -> Iterator[BuildingFits]:
+    """Search every set by itself; a set without a fit is passed over.
+
+    Args:
+        sets: Names and sets.
+        scan: The scan.
+    """
+    for name, places in sets:
+        trace = places.explain(scan)
+        if trace.in_map is not None and trace.hypotheses:
+            count = len(trace.in_map.hypotheses)
+            yield BuildingFits(name, trace.in_map.fits[:count], trace.in_map.hypotheses)
+
+
+def decide_over(
+    found: Sequence[BuildingFits],
+    sets: int,
+    settings: DecisionSettings,
+    look_alikes: float = LOOK_ALIKES,
+) -> list[BuildingHypothesis]:
+    """Put what many sets found for one scan into one order, and decide once.
+
+    Args:
+        found: What the sets found, in any order.
+        sets: How many sets were asked, those without a fit as well.
+        settings: Of the decision.
+        look_alikes: How fast the odds fall with the number of sets.
+
+    Returns:
+        Hypotheses of all buildings, best first, as many as one set gives at most.
+    """
+    if not found:
+        return []
+    best, fits = ranked(found)
+    harder = settings.constant - look_alikes * math.log(max(sets, 1))
+    decision = decide(fits, settings.model_copy(update={"constant": harder}))
+    probabilities = decision.probabilities.tolist()
+    rival = next((k for k, (each, _) in enumerate(best) if each is not best[0][0]), None)
+    if rival is not None:
+        margin = float(fits.features[0, _SCORE] - fits.features[rival, _SCORE])
+        first = min(probabilities[0], no_twin(margin))
+        held_back = probabilities[0] - first
+        probabilities = [min(value, first) for value in probabilities]
+        probabilities[rival] = min(probabilities[rival] + held_back, first)
+    is_answer = probabilities[0] >= settings.threshold
+    return [
+        BuildingHypothesis(
+            each.building,
+            replace(
+                each.hypotheses[n],
+                probability=probabilities[rank],
+                accepted=is_answer and rank == 0,
+            ),
+        )
+        for rank, (each, n) in enumerate(best)
+    ]
+
+
+def no_twin(margin: float) -> float:
+    """Return the most that an answer can be worth, by its margin to the best other building."""
+    return 1.0 - 0.5 * math.exp(-0.5 * (margin / TWINS) ** 2)
+
+
+def ranked(found: Sequence[BuildingFits]) -> tuple[list[tuple[BuildingFits, int]], Fits]:
+    """Put the fits of many sets into one order, best score first.
+
+    Returns:
+        For each of the best, as many as one set has at most, its set and its number there; and
+        the fits themselves.
+    """
+    most = max(len(each.fits) for each in found)
+    scores = [
+        (-score, each.building, place, n)
+        for place, each in enumerate(found)
+        for n, score in enumerate(each.fits.features[:, _SCORE].tolist())
+    ]
+    best = [(found[place], n) for _, _, place, n in sorted(scores)[:most]]
+    return best, _joined([each.fits[n : n + 1] for each, n in best])
+
+
+def set_files(paths: Iterable[str | os.PathLike[str]]) -> list[Path]:
+    """Name the files of sets; of a folder, all that end in ``.apr``.
+
+    Raises:
+        ReferenceSetError: A folder has none.
+    """
+    files: list[Path] = []
+    for path in map(Path, paths):
+        if path.is_dir():
+            within = sorted(path.glob(f"*{_SUFFIX}"))
+            if not within:
+                raise ReferenceSetError(f"{path}: has no set: no file that ends in {_SUFFIX}")
+            files += within
+        else:
+            files.append(path)
+    return files
+
+
+def _joined(parts: Sequence[Fits]) -> Fits:
+    return Fits(
+        np.concatenate([part.poses for part in parts]),
+        np.concatenate([part.features for part in parts]),
+        np.concatenate([part.hessians for part in parts]),
+        np.concatenate([part.residuals for part in parts]),
+        parts[0].readings,
+    )
+
+
+def _shares(
+    items: Sequence[tuple[str, ReferenceSet]], count: int
+) -> list[Sequence[tuple[str, ReferenceSet]]]:
+    """Deal items out, so that large and small sets mix."""
+    return [items[start::count] for start in range(min(count, len(items)))]
