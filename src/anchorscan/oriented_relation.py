@@ -29,8 +29,9 @@ from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -119,6 +120,26 @@ class EdgesByKey:
     def __len__(self) -> int:
         return len(self.postings)
 
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """Return what a file has to hold."""
+        return {"keys": self.keys, "starts": self.starts, "postings": self.postings}
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, NDArray[Any]], slots: int) -> EdgesByKey:
+        """Take what ``arrays`` gave, for so many slots; nothing is copied.
+
+        Raises:
+            ValueError: The arrays do not fit together.
+        """
+        keys, starts, postings = (arrays.get(name) for name in ("keys", "starts", "postings"))
+        if keys is None or starts is None or postings is None:
+            raise ValueError("arrays of edges are missing")
+        if any(each.dtype != np.uint32 or each.ndim != 1 for each in (keys, starts, postings)):
+            raise ValueError("arrays of edges are of another kind")
+        if not _fit_together(keys, starts, postings, slots):
+            raise ValueError("arrays of edges do not fit together")
+        return cls(keys, starts, postings)
+
     def merged(self, other: EdgesByKey) -> EdgesByKey:
         """Merge the edges of later slots into these."""
         return EdgesByKey(
@@ -171,6 +192,14 @@ class OrientedRelation:
             postings.append(np.uint32(slot << _TURN_BITS) | turns)
         sizes = np.array([len(each) for each in keys[1:]], np.int32)
         return EdgesByKey.of(np.concatenate(keys), np.concatenate(postings)), sizes
+
+    def part(self, arrays: Mapping[str, NDArray[Any]], slots: int) -> EdgesByKey:
+        """Take edges of so many slots from arrays.
+
+        Raises:
+            ValueError: The arrays do not fit together.
+        """
+        return EdgesByKey.from_arrays(arrays, slots)
 
     def size(self, graph: AnchorGraph) -> int:
         """Return the number of edges of a graph that are used."""
@@ -384,6 +413,20 @@ def _ranges(wanted, keys, starts, contents, shift):  # type: ignore[no-untyped-d
             ranges[c, 0] = starts[low]
             ranges[c, 1] = starts[low + 1]
     return ranges
+
+
+@kernel
+def _fit_together(keys, starts, postings, slots):  # type: ignore[no-untyped-def]
+    """Whether keys ascend, their postings follow each other, and all name slots."""
+    if len(starts) != len(keys) + 1 or starts[0] != 0 or starts[-1] != len(postings):
+        return False
+    for k in range(len(keys)):
+        if starts[k + 1] <= starts[k] or (k > 0 and keys[k] <= keys[k - 1]):
+            return False
+    for posting in postings:
+        if posting >> np.uint32(_TURN_BITS) >= slots:
+            return False
+    return True
 
 
 @kernel
