@@ -55,9 +55,7 @@ def write_arrays(path: Path, arrays: Mapping[str, NDArray[Any]], made_of: str) -
         draft.unlink(missing_ok=True)
 
 
-def read_arrays(
-    path: Path, made_of: str, *, verify: bool = True
-) -> dict[str, NDArray[Any]] | None:
+def read_arrays(path: Path, made_of: str, *, verify: bool = True) -> dict[str, NDArray[Any]] | None:
     """Map the arrays of a file, read-only.
 
     Args:

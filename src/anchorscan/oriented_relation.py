@@ -423,10 +423,7 @@ def _fit_together(keys, starts, postings, slots):  # type: ignore[no-untyped-def
     for k in range(len(keys)):
         if starts[k + 1] <= starts[k] or (k > 0 and keys[k] <= keys[k - 1]):
             return False
-    for posting in postings:
-        if posting >> np.uint32(_TURN_BITS) >= slots:
-            return False
-    return True
+    return len(postings) == 0 or postings.max() >> np.uint32(_TURN_BITS) < slots
 
 
 @kernel
