@@ -47,7 +47,7 @@ def write_arrays(path: Path, arrays: Mapping[str, NDArray[Any]], made_of: str) -
             stream.write(_MAGIC + head)
             for array in kept.values():
                 stream.write(b"\0" * (_aligned(stream.tell()) - stream.tell()))
-                stream.write(memoryview(array).cast("B") if array.size else b"")
+                stream.write(_bytes(array))
             stream.flush()
             os.fsync(stream.fileno())
         draft.replace(path)
@@ -92,6 +92,11 @@ def _little(array: NDArray[Any]) -> NDArray[Any]:
     return np.ascontiguousarray(array, array.dtype.newbyteorder("<"))
 
 
+def _bytes(array: NDArray[Any]) -> memoryview:
+    """The bytes of an array in one piece, not copied."""
+    return array.reshape(-1).view(np.uint8).data
+
+
 def _aligned(offset: int) -> int:
     return -(-offset // _ALIGNED) * _ALIGNED
 
@@ -103,7 +108,7 @@ def _head(arrays: Mapping[str, NDArray[Any]], made_of: str) -> bytes:
             "dtype": array.dtype.str,
             "shape": list(array.shape),
             "offset": 0,
-            "crc32": zlib.crc32(memoryview(array).cast("B") if array.size else b""),
+            "crc32": zlib.crc32(_bytes(array)),
         }
         for name, array in arrays.items()
     }
@@ -131,6 +136,6 @@ def _mapped(whole: mmap.mmap, entry: Mapping[str, Any], verify: bool) -> NDArray
     if offset < 0 or offset + count * dtype.itemsize > len(whole):
         raise ValueError("an array beyond the end of the file")
     array = np.frombuffer(whole, dtype, count, offset) if count else np.empty(0, dtype)
-    if verify and zlib.crc32(array.view(np.uint8) if count else b"") != entry["crc32"]:
+    if verify and zlib.crc32(_bytes(array)) != entry["crc32"]:
         raise ValueError("an array is damaged")
     return array.reshape(shape)

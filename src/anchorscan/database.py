@@ -19,7 +19,7 @@ large merge.  So a reader keeps what it has begun with, and writing costs little
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Literal, TypeVar
 
@@ -123,9 +123,15 @@ class RelationshipDatabase:
         else:
             self._relation = OrientedRelation(settings.oriented)
             self._fewest = _FEWEST_EDGES
-        begin = list(graphs)
-        identifiers = np.array([identifier for identifier, _ in begin], np.int64)
-        self._hold(*self._relation.edges([graph for _, graph in begin], 0), identifiers)
+        identifiers: list[int] = []
+
+        def in_slots() -> Iterator[AnchorGraph]:
+            for identifier, graph in graphs:
+                identifiers.append(identifier)
+                yield graph
+
+        edges, sizes = self._relation.edges(in_slots(), 0)
+        self._state = self._beginning(edges, sizes, np.array(identifiers, np.int64))
 
     @classmethod
     def from_arrays(
@@ -149,7 +155,7 @@ class RelationshipDatabase:
             raise ValueError("arrays of references do not fit together")
         made = cls(settings)
         edges = made._relation.part(arrays, len(identifiers))
-        made._hold(edges, np.array(sizes), np.array(identifiers))
+        made._state = made._beginning(edges, np.array(sizes), np.array(identifiers))
         return made
 
     def arrays(self) -> dict[str, NDArray[Any]]:
@@ -223,13 +229,15 @@ class RelationshipDatabase:
             return Votes(*_in_order(counts, sizes, identifiers, edges, most))
         return Votes(*_best(counts, sizes, identifiers, edges, min(most, state.used)))
 
-    def _hold(self, edges: Any, sizes: NDArray[np.int32], identifiers: NDArray[np.int64]) -> None:
-        """Begin with the edges of references in slots from zero on."""
+    def _beginning(
+        self, edges: Any, sizes: NDArray[np.int32], identifiers: NDArray[np.int64]
+    ) -> _State:
+        """Hold the edges of references in slots from zero on, and nothing else."""
         self._slots = {identifier: slot for slot, identifier in enumerate(identifiers.tolist())}
         if len(self._slots) != len(identifiers):
             raise ValueError("two references have the same identifier")
         self._removed = 0
-        self._state = _State((edges,), identifiers, sizes, len(sizes), len(sizes))
+        return _State((edges,), identifiers, sizes, len(sizes), len(sizes))
 
     def _forget_removed(self, *, one_part: bool = False) -> None:
         """Leave out what was removed and count the slots anew."""

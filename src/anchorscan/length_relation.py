@@ -14,7 +14,7 @@ q_m is one exactly for graphs whose lengths agree throughout.
 from __future__ import annotations
 
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -101,12 +101,12 @@ class LengthRelation:
         self._scratch = threading.local()
 
     def edges(
-        self, graphs: Sequence[AnchorGraph], first: int
+        self, graphs: Iterable[AnchorGraph], first: int
     ) -> tuple[EdgesByLength, NDArray[np.int32]]:
         """Order the edges of references in slots from ``first`` on, and count them for each."""
-        sizes = np.array([len(graph) for graph in graphs], np.int32)
-        lengths = np.concatenate([_NO_LENGTHS, *(graph.lengths for graph in graphs)])
-        lengths = lengths.astype(np.float32)
+        of_graphs = [_NO_LENGTHS, *(graph.lengths.astype(np.float32) for graph in graphs)]
+        sizes = np.array([len(each) for each in of_graphs[1:]], np.int32)
+        lengths = np.concatenate(of_graphs)
         slots = np.repeat(np.arange(first, first + len(sizes), dtype=np.int32), sizes)
         order = np.argsort(lengths, kind="stable")
         return EdgesByLength(lengths[order], slots[order], _starts(lengths)), sizes
@@ -176,7 +176,7 @@ def _bins(lengths: NDArray[np.float32]) -> NDArray[np.int64]:
     return np.minimum(lengths.astype(np.float64) / _BIN_WIDTH, _BINS - 1).astype(np.int64)
 
 
-_NO_LENGTHS = np.empty(0)
+_NO_LENGTHS = np.empty(0, np.float32)
 
 
 @kernel

@@ -29,8 +29,9 @@ from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -53,6 +54,8 @@ _TURN_BITS = 2
 _FULL = (1 << 16) - 1
 _FINEST_UNIT = 256
 _EXPECTED_TOTAL = 30_000
+# References whose edges are put together at once.
+_AT_ONCE = 4096
 # Keys of a part per entry of its table of contents, about.
 _KEYS_PER_ENTRY = 64
 
@@ -182,16 +185,23 @@ class OrientedRelation:
         self._scratch = threading.local()
 
     def edges(
-        self, graphs: Sequence[AnchorGraph], first: int
+        self, graphs: Iterable[AnchorGraph], first: int
     ) -> tuple[EdgesByKey, NDArray[np.int32]]:
         """Order the edges of references in slots from ``first`` on, and count them for each."""
-        keys, postings = [_NOTHING], [_NOTHING]
-        for slot, graph in enumerate(graphs, first):
-            of_graph, turns = _keys(_anchors(graph), self._limits, self._settings.most_edges)
-            keys.append(of_graph)
-            postings.append(np.uint32(slot << _TURN_BITS) | turns)
-        sizes = np.array([len(each) for each in keys[1:]], np.int32)
-        return EdgesByKey.of(np.concatenate(keys), np.concatenate(postings)), sizes
+        keys, postings, sizes = [_NOTHING], [_NOTHING], [_NO_SIZES]
+        slots = enumerate(graphs, first)
+        while some := list(islice(slots, _AT_ONCE)):
+            found = [
+                _keys(_anchors(graph), self._limits, self._settings.most_edges) for _, graph in some
+            ]
+            count = np.array([len(of_graph) for of_graph, _ in found], np.int32)
+            owners = np.repeat(np.array([slot for slot, _ in some], np.uint32), count)
+            turns = np.concatenate([turns for _, turns in found])
+            keys.append(np.concatenate([of_graph for of_graph, _ in found]))
+            postings.append(owners << np.uint32(_TURN_BITS) | turns)
+            sizes.append(count)
+        edges = EdgesByKey.of(np.concatenate(keys), np.concatenate(postings))
+        return edges, np.concatenate(sizes)
 
     def part(self, arrays: Mapping[str, NDArray[Any]], slots: int) -> EdgesByKey:
         """Take edges of so many slots from arrays.
@@ -263,6 +273,7 @@ class OrientedRelation:
 
 
 _NOTHING = np.empty(0, np.uint32)
+_NO_SIZES = np.empty(0, np.int32)
 
 
 def _anchors(
