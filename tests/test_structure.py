@@ -38,6 +38,7 @@ LEAVES = {
         "ablation",
         "benchmark",
         "calibration",
+        "growth",
         "report",
         "figures",
         "viewer",
