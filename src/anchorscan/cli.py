@@ -726,6 +726,71 @@ def bench(
 
 @app.command()
 @_guarded
+def scale(
+    logs: Annotated[
+        list[str] | None,
+        typer.Argument(
+            metavar="[BUILDING=]LOG...", help="Logs with poses; those in ANCHORSCAN_DATA if none."
+        ),
+    ] = None,
+    sizes: Annotated[
+        list[int] | None,
+        typer.Option(
+            "--references", min=1, metavar="N", help="Again for more; 100 to 1,000,000 if none."
+        ),
+    ] = None,
+    output: Annotated[
+        Path | None,
+        typer.Option("--output", "-o", metavar="DIR", help="Folder for tables and a picture."),
+    ] = None,
+    queries: Annotated[
+        int | None, typer.Option(min=1, metavar="N", help="At most so many queries of each split.")
+    ] = None,
+    seed: Annotated[int, typer.Option(help="Of the distractors, and of the queries.")] = 0,
+    preset: PresetOption = None,
+    settings_file: SettingsOption = None,
+) -> None:
+    """Measure how the search for candidates grows with the number of references.
+
+    Real queries (P1 and P3) are asked for the references of their place among references of
+    other places, made from real and simulated scans. A million need 3 GB of memory.
+    """
+    from .benchmark import default_logs, read_drives, tasks
+    from .growth import SIZES, Place, measure
+    from .settings import Settings
+
+    drives = read_drives(logs or default_logs(_say))
+    places = [
+        Place(
+            f"{task.protocol} {task.place}",
+            task.known.building,
+            task.references,
+            tuple((scan, pose) for scan, pose in task.queries if pose is not None),
+            tuple(record.scan for record in task.known.records if record.scan is not None),
+            task.split.spacing,
+            task.split.heading,
+        )
+        for task in tasks(drives, ("P1", "P3"))
+    ]
+    growth = measure(
+        places,
+        _read_settings(preset, settings_file) or Settings.preset(),
+        sizes=sorted(set(sizes or SIZES)),
+        queries=queries,
+        seed=seed,
+        say=_say,
+    )
+    for line in growth.lines():
+        typer.echo(line)
+    if output is not None:
+        for path in growth.write(output):
+            typer.echo(str(path))
+        growth.draw(output / "growth.png")
+        typer.echo(str(output / "growth.png"))
+
+
+@app.command()
+@_guarded
 def bench_fleet(
     logs: Annotated[
         list[str] | None,

@@ -19,7 +19,7 @@ large merge.  So a reader keeps what it has begun with, and writing costs little
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Literal, TypeVar
 
@@ -123,14 +123,55 @@ class RelationshipDatabase:
         else:
             self._relation = OrientedRelation(settings.oriented)
             self._fewest = _FEWEST_EDGES
-        begin = list(graphs)
-        identifiers = np.array([identifier for identifier, _ in begin], np.int64)
-        self._slots = {identifier: slot for slot, identifier in enumerate(identifiers.tolist())}
-        if len(self._slots) != len(begin):
-            raise ValueError("two references have the same identifier")
-        edges, sizes = self._relation.edges([graph for _, graph in begin], 0)
-        self._removed = 0
-        self._state = _State((edges,), identifiers, sizes, len(begin), len(begin))
+        identifiers: list[int] = []
+
+        def in_slots() -> Iterator[AnchorGraph]:
+            for identifier, graph in graphs:
+                identifiers.append(identifier)
+                yield graph
+
+        edges, sizes = self._relation.edges(in_slots(), 0)
+        self._state = self._beginning(edges, sizes, np.array(identifiers, np.int64))
+
+    @classmethod
+    def from_arrays(
+        cls, settings: DatabaseSettings, arrays: Mapping[str, NDArray[Any]]
+    ) -> RelationshipDatabase:
+        """Take what ``arrays`` gave, which may be mapped from a file; the edges are not copied.
+
+        Args:
+            settings: The same as those of the database that gave the arrays.
+            arrays: By name.
+
+        Raises:
+            ValueError: The arrays do not fit together, or are those of another relation.
+        """
+        identifiers, sizes = arrays.get("identifiers"), arrays.get("sizes")
+        if identifiers is None or sizes is None:
+            raise ValueError("arrays of references are missing")
+        if identifiers.dtype != np.int64 or sizes.dtype != np.int32 or identifiers.ndim != 1:
+            raise ValueError("arrays of references are of another kind")
+        if identifiers.shape != sizes.shape or (len(sizes) and sizes.min() < 0):
+            raise ValueError("arrays of references do not fit together")
+        made = cls(settings)
+        edges = made._relation.part(arrays, len(identifiers))
+        made._state = made._beginning(edges, np.array(sizes), np.array(identifiers))
+        return made
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """Return all that the database holds, as plain arrays by name.
+
+        ``identifiers`` (N,) int64 and ``sizes`` (N,) int32 of the references, and the edges:
+        ``keys`` (K,), ``starts`` (K + 1,) and ``postings`` (E,), all uint32, or, by length,
+        ``lengths`` (E,) float32 and ``slots`` (E,) int32.
+        """
+        with self._writing:
+            if self._removed or len(self._state.parts) > 1:
+                self._forget_removed(one_part=True)
+            state = self._state
+        used = state.used
+        references = {"identifiers": state.identifiers[:used], "sizes": state.sizes[:used].copy()}
+        return {**references, **state.parts[0].arrays()}
 
     def __len__(self) -> int:
         return len(self._slots)
@@ -188,12 +229,22 @@ class RelationshipDatabase:
             return Votes(*_in_order(counts, sizes, identifiers, edges, most))
         return Votes(*_best(counts, sizes, identifiers, edges, min(most, state.used)))
 
-    def _forget_removed(self) -> None:
+    def _beginning(
+        self, edges: Any, sizes: NDArray[np.int32], identifiers: NDArray[np.int64]
+    ) -> _State:
+        """Hold the edges of references in slots from zero on, and nothing else."""
+        self._slots = {identifier: slot for slot, identifier in enumerate(identifiers.tolist())}
+        if len(self._slots) != len(identifiers):
+            raise ValueError("two references have the same identifier")
+        self._removed = 0
+        return _State((edges,), identifiers, sizes, len(sizes), len(sizes))
+
+    def _forget_removed(self, *, one_part: bool = False) -> None:
         """Leave out what was removed and count the slots anew."""
         state, used = self._state, self._state.used
         alive = state.sizes[:used] >= 0
         numbers = np.where(alive, np.cumsum(alive, dtype=np.int32) - np.int32(1), np.int32(-1))
-        parts = _tidied([part.renumbered(numbers) for part in state.parts])
+        parts = _tidied([part.renumbered(numbers) for part in state.parts], one_part)
         identifiers, sizes = state.identifiers[:used][alive], state.sizes[:used][alive]
         self._slots = {identifier: slot for slot, identifier in enumerate(identifiers.tolist())}
         self._removed = 0
@@ -209,11 +260,12 @@ def quality(graph: AnchorGraph, other: AnchorGraph, settings: DatabaseSettings) 
     return float(count) ** 2 / pairs
 
 
-def _tidied(parts: list[Any]) -> tuple[Any, ...]:
-    """Merge the last parts until each is much smaller than the one before it."""
+def _tidied(parts: list[Any], one_part: bool = False) -> tuple[Any, ...]:
+    """Merge the last parts until each is much smaller than the one before it, or all."""
     while len(parts) > 1:
         before, last = len(parts[-2]), len(parts[-1])
-        if before + last > _SMALLEST_PART and last <= _MERGED_SHARE * before:
+        small_enough = before + last > _SMALLEST_PART and last <= _MERGED_SHARE * before
+        if small_enough and not one_part:
             break
         last = parts.pop()
         parts[-1] = parts[-1].merged(last)

@@ -14,8 +14,9 @@ q_m is one exactly for graphs whose lengths agree throughout.
 from __future__ import annotations
 
 import threading
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,6 +47,28 @@ class EdgesByLength:
 
     def __len__(self) -> int:
         return len(self.lengths)
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """Return what a file has to hold."""
+        return {"lengths": self.lengths, "slots": self.slots}
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, NDArray[Any]], slots: int) -> EdgesByLength:
+        """Take what ``arrays`` gave, for so many slots; nothing is copied.
+
+        Raises:
+            ValueError: The arrays do not fit together.
+        """
+        lengths, owners = arrays.get("lengths"), arrays.get("slots")
+        if lengths is None or owners is None:
+            raise ValueError("arrays of edges are missing")
+        if lengths.dtype != np.float32 or owners.dtype != np.int32 or lengths.ndim != 1:
+            raise ValueError("arrays of edges are of another kind")
+        if lengths.shape != owners.shape or not np.all(lengths[1:] >= lengths[:-1]):
+            raise ValueError("arrays of edges do not fit together")
+        if len(owners) and not 0 <= owners.min() <= owners.max() < slots:
+            raise ValueError("arrays of edges do not fit together")
+        return cls(lengths, owners, _starts(lengths))
 
     def merged(self, other: EdgesByLength) -> EdgesByLength:
         """Merge the edges of later slots into these."""
@@ -78,17 +101,23 @@ class LengthRelation:
         self._scratch = threading.local()
 
     def edges(
-        self, graphs: Sequence[AnchorGraph], first: int
+        self, graphs: Iterable[AnchorGraph], first: int
     ) -> tuple[EdgesByLength, NDArray[np.int32]]:
         """Order the edges of references in slots from ``first`` on, and count them for each."""
-        sizes = np.array([len(graph) for graph in graphs], np.int32)
-        lengths = np.concatenate([_NO_LENGTHS, *(graph.lengths for graph in graphs)])
-        lengths = lengths.astype(np.float32)
+        of_graphs = [_NO_LENGTHS, *(graph.lengths.astype(np.float32) for graph in graphs)]
+        sizes = np.array([len(each) for each in of_graphs[1:]], np.int32)
+        lengths = np.concatenate(of_graphs)
         slots = np.repeat(np.arange(first, first + len(sizes), dtype=np.int32), sizes)
         order = np.argsort(lengths, kind="stable")
-        starts = np.zeros(_BINS + 1, np.int64)
-        np.cumsum(np.bincount(_bins(lengths), minlength=_BINS), out=starts[1:])
-        return EdgesByLength(lengths[order], slots[order], starts), sizes
+        return EdgesByLength(lengths[order], slots[order], _starts(lengths)), sizes
+
+    def part(self, arrays: Mapping[str, NDArray[Any]], slots: int) -> EdgesByLength:
+        """Take edges of so many slots from arrays.
+
+        Raises:
+            ValueError: The arrays do not fit together.
+        """
+        return EdgesByLength.from_arrays(arrays, slots)
 
     def size(self, graph: AnchorGraph) -> int:
         """Return the number of edges of a graph."""
@@ -135,12 +164,19 @@ def corresponding_lengths(
     return int(_count_pair(graph.lengths, other.lengths, tolerance, count_once))
 
 
+def _starts(lengths: NDArray[np.float32]) -> NDArray[np.int64]:
+    """(_BINS + 1,) where each length bin begins once (E,) lengths are in order."""
+    starts = np.zeros(_BINS + 1, np.int64)
+    np.cumsum(np.bincount(_bins(lengths), minlength=_BINS), out=starts[1:])
+    return starts
+
+
 def _bins(lengths: NDArray[np.float32]) -> NDArray[np.int64]:
     """(E,) bin of each length, by the very expression that the kernel uses."""
     return np.minimum(lengths.astype(np.float64) / _BIN_WIDTH, _BINS - 1).astype(np.int64)
 
 
-_NO_LENGTHS = np.empty(0)
+_NO_LENGTHS = np.empty(0, np.float32)
 
 
 @kernel

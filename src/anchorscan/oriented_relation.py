@@ -29,8 +29,10 @@ from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import islice
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,6 +54,8 @@ _TURN_BITS = 2
 _FULL = (1 << 16) - 1
 _FINEST_UNIT = 256
 _EXPECTED_TOTAL = 30_000
+# References whose edges are put together at once.
+_AT_ONCE = 4096
 # Keys of a part per entry of its table of contents, about.
 _KEYS_PER_ENTRY = 64
 
@@ -119,6 +123,26 @@ class EdgesByKey:
     def __len__(self) -> int:
         return len(self.postings)
 
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """Return what a file has to hold."""
+        return {"keys": self.keys, "starts": self.starts, "postings": self.postings}
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, NDArray[Any]], slots: int) -> EdgesByKey:
+        """Take what ``arrays`` gave, for so many slots; nothing is copied.
+
+        Raises:
+            ValueError: The arrays do not fit together.
+        """
+        keys, starts, postings = (arrays.get(name) for name in ("keys", "starts", "postings"))
+        if keys is None or starts is None or postings is None:
+            raise ValueError("arrays of edges are missing")
+        if any(each.dtype != np.uint32 or each.ndim != 1 for each in (keys, starts, postings)):
+            raise ValueError("arrays of edges are of another kind")
+        if not _fit_together(keys, starts, postings, slots):
+            raise ValueError("arrays of edges do not fit together")
+        return cls(keys, starts, postings)
+
     def merged(self, other: EdgesByKey) -> EdgesByKey:
         """Merge the edges of later slots into these."""
         return EdgesByKey(
@@ -161,16 +185,31 @@ class OrientedRelation:
         self._scratch = threading.local()
 
     def edges(
-        self, graphs: Sequence[AnchorGraph], first: int
+        self, graphs: Iterable[AnchorGraph], first: int
     ) -> tuple[EdgesByKey, NDArray[np.int32]]:
         """Order the edges of references in slots from ``first`` on, and count them for each."""
-        keys, postings = [_NOTHING], [_NOTHING]
-        for slot, graph in enumerate(graphs, first):
-            of_graph, turns = _keys(_anchors(graph), self._limits, self._settings.most_edges)
-            keys.append(of_graph)
-            postings.append(np.uint32(slot << _TURN_BITS) | turns)
-        sizes = np.array([len(each) for each in keys[1:]], np.int32)
-        return EdgesByKey.of(np.concatenate(keys), np.concatenate(postings)), sizes
+        keys, postings, sizes = [_NOTHING], [_NOTHING], [_NO_SIZES]
+        slots = enumerate(graphs, first)
+        while some := list(islice(slots, _AT_ONCE)):
+            found = [
+                _keys(_anchors(graph), self._limits, self._settings.most_edges) for _, graph in some
+            ]
+            count = np.array([len(of_graph) for of_graph, _ in found], np.int32)
+            owners = np.repeat(np.array([slot for slot, _ in some], np.uint32), count)
+            turns = np.concatenate([turns for _, turns in found])
+            keys.append(np.concatenate([of_graph for of_graph, _ in found]))
+            postings.append(owners << np.uint32(_TURN_BITS) | turns)
+            sizes.append(count)
+        edges = EdgesByKey.of(np.concatenate(keys), np.concatenate(postings))
+        return edges, np.concatenate(sizes)
+
+    def part(self, arrays: Mapping[str, NDArray[Any]], slots: int) -> EdgesByKey:
+        """Take edges of so many slots from arrays.
+
+        Raises:
+            ValueError: The arrays do not fit together.
+        """
+        return EdgesByKey.from_arrays(arrays, slots)
 
     def size(self, graph: AnchorGraph) -> int:
         """Return the number of edges of a graph that are used."""
@@ -234,6 +273,7 @@ class OrientedRelation:
 
 
 _NOTHING = np.empty(0, np.uint32)
+_NO_SIZES = np.empty(0, np.int32)
 
 
 def _anchors(
@@ -384,6 +424,17 @@ def _ranges(wanted, keys, starts, contents, shift):  # type: ignore[no-untyped-d
             ranges[c, 0] = starts[low]
             ranges[c, 1] = starts[low + 1]
     return ranges
+
+
+@kernel
+def _fit_together(keys, starts, postings, slots):  # type: ignore[no-untyped-def]
+    """Whether keys ascend, their postings follow each other, and all name slots."""
+    if len(starts) != len(keys) + 1 or starts[0] != 0 or starts[-1] != len(postings):
+        return False
+    for k in range(len(keys)):
+        if starts[k + 1] <= starts[k] or (k > 0 and keys[k] <= keys[k - 1]):
+            return False
+    return len(postings) == 0 or postings.max() >> np.uint32(_TURN_BITS) < slots
 
 
 @kernel
