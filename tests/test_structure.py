@@ -43,6 +43,7 @@ LEAVES = {
         "viewer",
         "demo",
         "map_check",
+        "sensor_pairs",
         "ros_node",
         "cli",
     ),
