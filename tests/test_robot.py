@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 import re
+import subprocess
+import sys
 import threading
 import time
 from pathlib import Path
@@ -312,3 +314,33 @@ def test_the_file_on_the_page_about_robots_is_understood() -> None:
     (text,) = re.findall(r"```yaml\n(anchorscan:.*?)```", page, re.DOTALL)
     given = yaml.safe_load(text)["anchorscan"]["ros__parameters"]
     RobotParameters(**given)
+
+
+def test_what_is_prepared_compiles_nothing_with_its_first_scans() -> None:
+    """In a process of its own: here other tests have compiled everything."""
+    code = """
+import sys
+from numba.core.dispatcher import Dispatcher
+from anchorscan import Matcher, Reference, drive, random_building
+from anchorscan.localizer import Localizer
+
+def compiled():
+    modules = [module for name, module in sys.modules.items() if name.startswith("anchorscan.")]
+    kernels = [each for m in modules for each in vars(m).values() if isinstance(each, Dispatcher)]
+    return sum(len(kernel.signatures) for kernel in kernels)
+
+records = drive(random_building(3, length=20.0, depth=14.0), seed=1, length=4.0)
+places = Matcher([Reference(r.index, r.scan, r.pose) for r in records[::4]])
+places.prepare()
+localizer = Localizer(places)
+localizer.prepare()
+before = compiled()
+for record in records:
+    localizer.update(record.scan, record.odometry, record.stamp)
+assert len(localizer.mixture)
+print(before, compiled())
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    before, after = done.stdout.split()
+    assert int(before) > 20
+    assert before == after

@@ -53,6 +53,7 @@ LEAVES = {
         "demo",
         "lost_robot",
         "map_check",
+        "sensor_pairs",
         "ros_node",
         "cli",
     ),

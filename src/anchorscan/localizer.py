@@ -31,9 +31,10 @@ from .belief import (
 )
 from .decision import held
 from .hypothesis import Hypothesis
-from .matcher import Candidates, Trace
+from .matcher import _ROOM, Candidates, Matcher, Trace
 from .motion import Motion, motion
 from .pose import Pose2D
+from .reference import Reference
 from .scan import LaserScan
 from .settings import Settings
 from .verification import Fits
@@ -118,6 +119,12 @@ class Localizer:
         self._stamp: float | None = None
         self._since_search = math.inf
         self._belief = Belief((), 1.0, False)
+
+    def prepare(self) -> None:
+        """Compile everything, so that the first real scan does not pay for it."""
+        other = Localizer(Matcher((Reference(0, _ROOM, Pose2D()),), self._places.settings))
+        for x in (0.0, 0.1):
+            other.update(_ROOM, Pose2D(x, 0.0, 0.0), x)
 
     @property
     def mixture(self) -> Mixture:

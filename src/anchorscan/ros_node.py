@@ -156,10 +156,12 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
                     raise SettingsError(f"{options.set_file} holds no references")
                 if all(each.pose is None for each in places.references):
                     raise SettingsError(f"{options.set_file} has no poses in a common frame")
-                places.prepare()
-                self._adopt(places)
             else:
-                ReferenceSet(settings=settings).prepare()
+                places = ReferenceSet(settings=settings)
+            places.prepare()
+            Localizer(places).prepare()
+            if options.set_file:
+                self._adopt(places)
         except AnchorscanError as error:
             self.get_logger().error(f"not configured: {error}")
             return TransitionCallbackReturn.FAILURE
