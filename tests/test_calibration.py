@@ -12,8 +12,8 @@ from anchorscan.calibration import Sample, fit, gather, rotate, weigh
 from anchorscan.decision import DecisionSettings
 from anchorscan.simulator import random_poses
 
-TRUE = np.array([1.0, 1.5, 2.0, -4.0])
-NAMES = ("constant", "log_margin", "explained", "through")
+TRUE = np.array([-3.0, 1.5, 2.0, -4.0, 0.5, 0.7])
+NAMES = ("constant", "log_margin", "explained", "through", "heading", "anchors")
 
 
 def drawn(building, count, seed, coefficients=TRUE):
@@ -24,6 +24,8 @@ def drawn(building, count, seed, coefficients=TRUE):
             np.log(rng.uniform(0.002, 0.5, count)),
             rng.uniform(0.5, 4.0, count),
             np.sqrt(rng.uniform(0.0, 0.3, count)),
+            np.log(rng.uniform(5.0, 5000.0, count)),
+            np.log1p(rng.integers(0, 20, count)),
         )
     )
     probability = 1.0 / (1.0 + np.exp(-(numbers @ coefficients)))
@@ -73,7 +75,7 @@ def test_evidence_is_gathered_and_judged_by_the_truth():
     said: list[str] = []
     case = Simulated()
     (sample,) = gather([case], Settings.preset("default"), 100, said.append)
-    assert sample.evidence.shape == (12, 4)
+    assert sample.evidence.shape == (12, 6)
     assert sample.correct.mean() > 0.8
     assert said == [f"P1 simulated: {sample.correct.sum()} of 12 right"]
     case.queries = [(scan, None) for scan, _ in case.queries]

@@ -94,7 +94,9 @@ def test_a_pose_that_is_exact_is_held_and_one_that_is_not_is_not() -> None:
 SETTINGS = [Settings.preset(name).decision for name in ("default", "thorough")]
 PRESETS = pytest.mark.parametrize("preset", SETTINGS, ids=["default", "thorough"])
 SCORE, THROUGH = FEATURES.index("score"), FEATURES.index("through")
-FIRM = np.diag([3e4, 3e4, 1e6])
+# As 72 readings of walls about 3 m away give, and as many anchor points.
+FIRM = np.diag([40.0, 30.0, 600.0])
+MANY = 10
 
 
 def fits_of(
@@ -104,7 +106,10 @@ def fits_of(
     readings: int = 120,
 ) -> Fits:
     features = np.full((len(scores), len(FEATURES)), math.nan)
-    features[:, SCORE], features[:1, THROUGH] = scores, through
+    features[:, SCORE], features[:, THROUGH] = (
+        scores,
+        [through, *[0.0] * len(scores)][: len(scores)],
+    )
     hessians = np.repeat(hessian[np.newaxis], len(scores), axis=0)
     return Fits(
         np.zeros((len(scores), 3)), features, hessians, np.full(len(scores), 1e-4), readings
@@ -118,16 +123,21 @@ scores_of_fits = st.lists(st.floats(-0.7, 1.0), min_size=1, max_size=8).map(
 
 
 @PRESETS
-@given(scores=scores_of_fits, through=shares, readings=st.integers(0, 500))
+@given(
+    scores=scores_of_fits,
+    through=shares,
+    readings=st.integers(0, 500),
+    anchors=st.integers(0, 60),
+)
 def test_probabilities_are_shared_out_in_order(
-    preset: DecisionSettings, scores: list[float], through: float, readings: int
+    preset: DecisionSettings, scores: list[float], through: float, readings: int, anchors: int
 ) -> None:
-    decision = decide(fits_of(scores, through, readings=readings), preset)
+    decision = decide(fits_of(scores, through, readings=readings), anchors, preset)
     assert decision.probabilities.shape == (len(scores),)
     assert np.all(decision.probabilities >= 0.0)
     assert decision.elsewhere >= 0.0
     assert decision.probabilities.sum() + decision.elsewhere == pytest.approx(1.0)
-    # Best first: no fit is likelier than one that explains more of the scan.
+    # Best first: no fit is likelier than one that is worth more.
     assert np.all(np.diff(decision.probabilities) <= 1e-15)
     assert decision.accepted == (decision.probabilities[0] >= preset.threshold)
 
@@ -138,7 +148,7 @@ def test_a_better_score_is_never_less_likely(
     preset: DecisionSettings, a: float, b: float, rival: float
 ) -> None:
     low, high = sorted((max(a, rival), max(b, rival)))
-    worse, better = (decide(fits_of([score, rival]), preset) for score in (low, high))
+    worse, better = (decide(fits_of([score, rival]), MANY, preset) for score in (low, high))
     assert better.probabilities[0] >= worse.probabilities[0]
 
 
@@ -148,7 +158,7 @@ def test_a_wider_margin_is_never_less_likely(
     preset: DecisionSettings, score: float, a: float, b: float
 ) -> None:
     low, high = sorted((min(a, score), min(b, score)))
-    near, far = (decide(fits_of([score, rival]), preset) for rival in (high, low))
+    near, far = (decide(fits_of([score, rival]), MANY, preset) for rival in (high, low))
     assert far.probabilities[0] >= near.probabilities[0]
     assert far.elsewhere + far.probabilities[0] >= near.probabilities[0]
 
@@ -158,7 +168,7 @@ def test_a_wider_margin_is_never_less_likely(
 def test_seeing_through_walls_is_never_likelier(
     preset: DecisionSettings, score: float, a: float, b: float
 ) -> None:
-    few, many = (decide(fits_of([score, 0.3], share), preset) for share in sorted((a, b)))
+    few, many = (decide(fits_of([score, 0.3], share), MANY, preset) for share in sorted((a, b)))
     assert few.probabilities[0] >= many.probabilities[0]
 
 
@@ -167,7 +177,7 @@ def test_seeing_through_walls_is_never_likelier(
 def test_more_readings_are_never_less_likely(
     preset: DecisionSettings, score: float, a: int, b: int
 ) -> None:
-    low, high = (decide(fits_of([score, 0.2], readings=n), preset) for n in sorted((a, b)))
+    low, high = (decide(fits_of([score, 0.2], readings=n), MANY, preset) for n in sorted((a, b)))
     assert high.probabilities[0] >= low.probabilities[0]
 
 
@@ -175,26 +185,26 @@ def test_more_readings_are_never_less_likely(
 def test_a_scan_that_one_place_explains_is_an_answer_and_one_that_two_do_is_none(
     preset: DecisionSettings,
 ) -> None:
-    assert decide(fits_of([0.95, 0.45]), preset).accepted
-    twins = decide(fits_of([0.95, 0.95]), preset)
+    assert decide(fits_of([0.95, 0.45]), MANY, preset).accepted
+    twins = decide(fits_of([0.95, 0.95]), MANY, preset)
     assert not twins.accepted
     assert twins.probabilities[1] > 0.5 * twins.probabilities[0]
-    assert not decide(fits_of([0.3, 0.1]), preset).accepted
+    assert not decide(fits_of([0.3, 0.1]), MANY, preset).accepted
 
 
 @PRESETS
 def test_a_single_fit_stands_for_itself(preset: DecisionSettings) -> None:
-    alone = decide(fits_of([0.9]), preset)
+    alone = decide(fits_of([0.9]), MANY, preset)
     assert alone.probabilities.shape == (1,)
     assert alone.elsewhere == pytest.approx(1.0 - alone.probabilities[0])
     # As if the rival scored half as much.
-    rivalled = decide(fits_of([0.9, 0.45]), preset)
+    rivalled = decide(fits_of([0.9, 0.45]), MANY, preset)
     assert alone.probabilities[0] == rivalled.probabilities[0]
 
 
 @PRESETS
 def test_without_a_fit_the_scan_is_from_elsewhere(preset: DecisionSettings) -> None:
-    nothing = decide(fits_of([]), preset)
+    nothing = decide(fits_of([]), MANY, preset)
     assert nothing.probabilities.shape == (0,)
     assert nothing.elsewhere == 1.0
     assert not nothing.accepted
@@ -210,7 +220,7 @@ def test_settings_out_of_all_proportion_still_give_probabilities(
     constant: float, elsewhere: float, rivalry: float, scores: list[float]
 ) -> None:
     odd = DecisionSettings(constant=constant, elsewhere=elsewhere, rivalry=rivalry)
-    decision = decide(fits_of(scores), odd)
+    decision = decide(fits_of(scores), MANY, odd)
     assert np.all((decision.probabilities >= 0.0) & (decision.probabilities <= 1.0))
     assert decision.probabilities.sum() + decision.elsewhere == pytest.approx(1.0)
 
@@ -239,14 +249,36 @@ def test_covariances_are_the_inverse_of_the_information(seed: int, count: int) -
 
 @PRESETS
 def test_a_pose_that_nothing_holds_is_no_answer(preset: DecisionSettings) -> None:
-    corridor = np.diag([0.0, 3e4, 1e6])
-    assert decide(fits_of([0.99, 0.3]), preset).accepted
-    assert not decide(fits_of([0.99, 0.3], hessian=corridor), preset).accepted
-    assert not decide(fits_of([0.99, 0.3], hessian=np.zeros((3, 3))), preset).accepted
+    corridor = np.diag([0.0, 40.0, 600.0])
+    assert decide(fits_of([0.99, 0.3]), MANY, preset).accepted
+    assert not decide(fits_of([0.99, 0.3], hessian=corridor), MANY, preset).accepted
+    assert not decide(fits_of([0.99, 0.3], hessian=np.zeros((3, 3))), MANY, preset).accepted
+
+
+@PRESETS
+@given(score=shares, a=st.integers(0, 100), b=st.integers(0, 100))
+def test_a_scan_of_more_anchor_points_is_never_less_likely(
+    preset: DecisionSettings, score: float, a: int, b: int
+) -> None:
+    few, many = (decide(fits_of([score, 0.2]), n, preset) for n in sorted((a, b)))
+    assert many.probabilities[0] >= few.probabilities[0]
+
+
+@PRESETS
+@given(score=shares, a=st.floats(0.0, 1e7), b=st.floats(0.0, 1e7))
+def test_a_wider_view_is_never_less_likely(
+    preset: DecisionSettings, score: float, a: float, b: float
+) -> None:
+    narrow, wide = (
+        decide(fits_of([score, 0.2], hessian=np.diag([40.0, 30.0, h])), MANY, preset)
+        for h in sorted((a, b))
+    )
+    assert wide.probabilities[0] >= narrow.probabilities[0]
 
 
 def test_evidence_is_what_the_text_says() -> None:
-    numbers = evidence(fits_of([0.9, 0.7], 0.04))
-    expected = [1.0, math.log(0.2), -math.log(0.1), 0.2]
+    numbers = evidence(fits_of([0.9, 0.7], 0.04), 7)
+    margin = (math.log(10.0) - 0.2) - math.log(1.0 / 0.3)
+    expected = [1.0, math.log(margin), math.log(10.0), 0.2, math.log(601.0), math.log(8.0)]
     np.testing.assert_allclose(numbers, expected)
-    assert np.all(np.isfinite(evidence(fits_of([1.0, 1.0], readings=0))))
+    assert np.all(np.isfinite(evidence(fits_of([1.0, 1.0], readings=0), 0)))

@@ -14,13 +14,13 @@ from scans import FULL_TURN, WIDE, building, seeds
 from anchorscan import Pose2D, Settings, simulate
 from anchorscan.field import LikelihoodField, cell_code, field_scores, passed_through, refined
 from anchorscan.proposal import spread
-from anchorscan.verification import FEATURES, Fits, VerificationSettings, verify
+from anchorscan.verification import FEATURES, Fits, VerificationSettings, verify, worth
 from anchorscan.verification import _distinct as distinct
 
 FIELD = Settings.preset("default").field
 WEIGHTS = FIELD.weights()
 LIMITS = VerificationSettings()
-SMALL = VerificationSettings(third_poses=6, fits=4, iterations=2, followed=1, rays=8)
+SMALL = VerificationSettings(third_poses=6, fits=4, iterations=2, rays=8)
 SCORE, THROUGH = FEATURES.index("score"), FEATURES.index("through")
 NOBODY = np.empty((0, 2))
 
@@ -74,6 +74,11 @@ def plain_features(pose, points, tiles):
     return [float(np.mean(shares[name])) for name in FEATURES]
 
 
+def plain_worth(score, through):
+    """What is unexplained counts by its logarithm, and what is seen through by its root."""
+    return math.log(1.0 / max(1.0 - score, 0.005)) - through**0.5
+
+
 def plain_distinct(poses, distance, turn, most):
     chosen = []
     for k, pose in enumerate(poses):
@@ -101,17 +106,15 @@ def plain_verify(poses, points, tiles, limits):
         pose = refined(
             np.array(best[k]), spread(points, limits.fit_readings), tiles, limits.iterations
         )
-        many = spread(points, limits.last_readings)
-        fits.append((pose, plain_features(pose, many, tiles)))
-    fits.sort(key=lambda fit: -fit[1][SCORE])
+        numbers = plain_features(pose, spread(points, limits.last_readings), tiles)
+        rays = spread(points, limits.rays)
+        numbers[THROUGH] = passed_through(pose, rays, tiles, limits.through_margin)
+        fits.append((pose, numbers))
+    fits.sort(key=lambda fit: -plain_worth(fit[1][SCORE], fit[1][THROUGH]))
     places = plain_distinct(
         [pose for pose, _ in fits], limits.place_distance, limits.place_turn, len(fits)
     )
-    fits = [fits[k] for k in places]
-    for pose, numbers in fits[: limits.followed]:
-        rays = spread(points, limits.rays)
-        numbers[THROUGH] = passed_through(pose, rays, tiles, limits.through_margin)
-    return fits
+    return [fits[k] for k in places]
 
 
 def check_against_twin(poses, points, tiles, limits):
@@ -160,6 +163,13 @@ def test_readings_are_chosen_evenly(count, most):
         assert abs(chosen[0] - (count - 1 - chosen[-1])) <= 1
 
 
+@given(st.floats(-1.0, 1.0), st.floats(0.0, 1.0))
+def test_the_worth_of_a_fit_is_the_twins(score, through):
+    assert worth(score, through) == pytest.approx(plain_worth(score, through))
+    # Nothing makes up for what the map contradicts, and nothing is lost by explaining more.
+    assert worth(score, through) <= worth(score, 0.0) <= worth(min(score + 0.1, 1.0), 0.0)
+
+
 # What they must find.
 
 
@@ -188,14 +198,12 @@ def test_fits_are_in_order_and_apart(mapped):
         )
         fits = verify(poses, scan.points, tiles, WEIGHTS, LIMITS)
         assert 1 <= len(fits) <= LIMITS.fits
-        assert np.all(np.diff(fits.features[:, SCORE]) <= 0.0)
+        worths = [worth(*pair) for pair in fits.features[:, [SCORE, THROUGH]].tolist()]
+        assert np.all(np.diff(worths) <= 0.0)
         for a, b in itertools.combinations([Pose2D(*row) for row in fits.poses], 2):
             apart = a.distance(b) >= LIMITS.place_distance
             assert apart or a.turn(b) >= LIMITS.place_turn
-        assert np.all(
-            np.isnan(fits.features[:, THROUGH]) == (np.arange(len(fits)) >= LIMITS.followed)
-        )
-        shares = np.delete(fits.features, [SCORE, THROUGH], axis=1)
+        shares = np.delete(fits.features, SCORE, axis=1)
         assert np.all((shares >= 0.0) & (shares <= 1.0))
         np.testing.assert_array_equal(fits.hessians, fits.hessians.transpose(0, 2, 1))
         assert np.all(np.linalg.eigvalsh(fits.hessians) > -1e-9)

@@ -29,10 +29,10 @@ from .settings import Settings
 
 __all__ = ["Case", "Fit", "Sample", "fit", "gather", "rotate", "weigh"]
 
-_PROTOCOL_WEIGHTS = {"P1": 1.0, "P2": 0.5, "P3": 1.0, "P4": 0.3}
+_PROTOCOL_WEIGHTS = {"P1": 1.0, "P2": 0.5, "P3": 1.0, "P4": 0.03}
 _RIDGE = 0.02
 _STEPS = 50
-_COEFFICIENTS = ("constant", "log_margin", "explained", "through")
+_COEFFICIENTS = ("constant", "log_margin", "explained", "through", "heading", "anchors")
 
 
 class Case(Protocol):
@@ -67,7 +67,7 @@ class Sample:
         protocol: "P1" to "P4".
         place: What tables call it.
         buildings: Of the references and of the queries.
-        evidence: (N, 4) of the best fit of each query.
+        evidence: (N, 6) of the best fit of each query.
         correct: (N,) whether that fit was right.
     """
 
@@ -120,9 +120,10 @@ def gather(
         asked = list(case.queries)
         rows, right = [], []
         for scan, truth in asked[:: max(1, len(asked) // queries)]:
-            search = matcher.explain(scan).in_map
+            trace = matcher.explain(scan)
+            search = trace.in_map
             if search is not None and len(search.fits):
-                rows.append(evidence(search.fits))
+                rows.append(evidence(search.fits, len(trace.description.anchors)))
                 right.append(_is_right(search.fits.poses[0], truth))
         sample = Sample(
             case.protocol, case.place, case.buildings, np.array(rows), np.array(right, bool)

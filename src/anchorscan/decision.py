@@ -1,12 +1,21 @@
 """From fits to probabilities: how sure one scan can be, and when to say "not known".
 
 The paper thresholds e_m and leaves probabilities to the filter.  Nearly all confident wrong
-answers have a near-equal twin elsewhere: the same shape in another room.  So the probability
-that the best fit is right is a logistic function of three numbers:
+answers have a near-equal twin elsewhere: the same shape in another room.  Where references are
+sparse, a short piece of wall fits many places, and the twin may be where nobody looked.  So the
+probability that the best fit is right is a logistic function of five numbers:
 
-    log m           of the margin m of its score to the best fit at another place,
+    log m           of the margin m of its worth (see ``verification``) to the best fit at
+                    another place,
     -log(1 - s)     of its score s: how much of the scan the map explains,
-    sqrt(through)   of the share of rays that pass through known surfaces.
+    sqrt(through)   of the share of rays that pass through known surfaces,
+    log(1 + h)      of the information h that the explained readings give on the heading: it
+                    grows with their number and the square of how far around they lie,
+    log(1 + a)      of the number a of anchor points of the scan: how much shape it shows.
+
+The first three compare the fit with others and with the map; the last two say how much the
+scan could tell at all, so that less of a margin will do for a wide view of many corners than
+for a look into a plain corner.
 
 The scans behind this have 120 readings or more.  Fewer can agree by chance, so that up to ten
 are held not to, the fewer there are the more.
@@ -18,7 +27,7 @@ neither changes an answer, since what was answered there is held to 9 cm in 99 o
 without them a scan with a single reading is an answer.
 
 What is left goes to the other fits and to "somewhere else", in proportion to
-``exp(rivalry * score)``; "somewhere else" competes with a fixed score.  No fit gets more than
+``exp(rivalry * worth)``; "somewhere else" competes with a fixed score.  No fit gets more than
 the best: what that would be is "somewhere else", too.
 
 The coefficients come from ``anchorscan calibrate``, which fits them on some buildings and
@@ -36,12 +45,12 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
 from ._jit import kernel
-from .verification import FEATURES, Fits
+from .verification import FEATURES, Fits, worth
 
 __all__ = ["Decision", "DecisionSettings", "covariance", "decide", "evidence", "held"]
 
 _SCORE, _THROUGH = FEATURES.index("score"), FEATURES.index("through")
-_SMALLEST_MARGIN, _LARGEST_SCORE = 0.002, 0.995
+_SMALLEST_MARGIN, _LARGEST_SCORE = 0.003, 0.995
 _MANY_READINGS, _LUCKY_READINGS = 120, 10.0
 _CORRECT_POSITION, _CORRECT_HEADING = 0.5, math.radians(10.0)
 
@@ -51,20 +60,22 @@ class DecisionSettings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
-    constant: float = Field(0.46, description="of the logistic function")
-    log_margin: float = Field(1.34, description="weight of the logarithm of the margin")
-    explained: float = Field(2.61, description="weight of -log(1 - score)")
+    constant: float = Field(-4.75, description="of the logistic function")
+    log_margin: float = Field(1.30, description="weight of the logarithm of the margin")
+    explained: float = Field(1.25, description="weight of -log(1 - score)")
     through: float = Field(
-        -5.06, description="weight of the root of the share of rays that see through"
+        -2.22, description="weight of the root of the share of rays that see through"
     )
-    rivalry: float = Field(30.0, gt=0.0, description="of the fits for what the best leaves")
+    heading: float = Field(0.78, description="weight of the logarithm of what holds the heading")
+    anchors: float = Field(0.65, description="weight of the logarithm of the anchor points")
+    rivalry: float = Field(4.5, gt=0.0, description="of the fits for what the best leaves")
     elsewhere: float = Field(0.8, description="score with which 'somewhere else' competes")
     threshold: float = Field(0.96, gt=0.0, le=1.0, description="probability that is an answer")
     range_deviation: float = Field(
         0.03, gt=0.0, description="least standard deviation of a reading, metres"
     )
     readings_alike: float = Field(
-        10.0, ge=1.0, description="readings that err together: so many count as one"
+        3.0, ge=1.0, description="readings that err together: so many count as one"
     )
     widest_deviation: float = Field(
         5.0, gt=0.0, description="standard deviation where nothing holds the pose, metres, radians"
@@ -86,19 +97,30 @@ class Decision:
     accepted: bool
 
 
-def evidence(fits: Fits) -> NDArray[np.float64]:
-    """Return the (4,) numbers that speak for the best fit: 1 and those of the module's text.
+def evidence(fits: Fits, anchors: int) -> NDArray[np.float64]:
+    """Return the (6,) numbers that speak for the best fit: 1 and those of the module's text.
 
     A fit without a rival has a margin as if the rival scored half as much.
+
+    Args:
+        fits: At least one.
+        anchors: How many anchor points the scan has.
     """
-    score = float(fits.features[0, _SCORE])
-    rival = float(fits.features[1, _SCORE]) if len(fits) > 1 else 0.5 * score
-    margin = max(score - rival, _SMALLEST_MARGIN)
+    score, through = (float(fits.features[0, k]) for k in (_SCORE, _THROUGH))
+    rival = _worths(fits[1:2])[0] if len(fits) > 1 else worth(0.5 * score, 0.0)
+    margin = max(worth(score, through) - rival, _SMALLEST_MARGIN)
     rest = 1.0 - min(score, _LARGEST_SCORE)
     rest += _LUCKY_READINGS * max(0.0, 1.0 / max(fits.readings, 1) - 1.0 / _MANY_READINGS)
-    explained = -math.log(rest)
-    through = float(fits.features[0, _THROUGH])
-    return np.array([1.0, math.log(margin), explained, math.sqrt(through)])
+    return np.array(
+        [
+            1.0,
+            math.log(margin),
+            -math.log(rest),
+            math.sqrt(through),
+            math.log1p(float(fits.hessians[0, 2, 2])),
+            math.log1p(anchors),
+        ]
+    )
 
 
 def covariance(fits: Fits, settings: DecisionSettings) -> NDArray[np.float64]:
@@ -152,8 +174,14 @@ def held(covariance: NDArray[np.float64]) -> float:
     return share
 
 
-def decide(fits: Fits, settings: DecisionSettings) -> Decision:
-    """Say how likely each fit is, best first, and whether the best is an answer."""
+def decide(fits: Fits, anchors: int, settings: DecisionSettings) -> Decision:
+    """Say how likely each fit is, best first, and whether the best is an answer.
+
+    Args:
+        fits: Of the scan.
+        anchors: How many anchor points the scan has.
+        settings: Of the decision.
+    """
     if not len(fits):
         return Decision(np.empty(0), 1.0, False)
     weights = (
@@ -161,15 +189,22 @@ def decide(fits: Fits, settings: DecisionSettings) -> Decision:
         settings.log_margin,
         settings.explained,
         settings.through,
+        settings.heading,
+        settings.anchors,
     )
-    place = _logistic(float(np.dot(evidence(fits), weights)))
+    place = _logistic(float(np.dot(evidence(fits, anchors), weights)))
     best = place * held(covariance(fits[:1], settings)[0])
-    scores = np.append(fits.features[1:, _SCORE], settings.elsewhere)
-    rivals = np.exp(settings.rivalry * (scores - scores.max()))
+    left = np.append(_worths(fits[1:]), worth(settings.elsewhere, 0.0))
+    rivals = np.exp(settings.rivalry * (left - left.max()))
     shares = (1.0 - best) * rivals[:-1] / rivals.sum()
     probabilities = np.array([best, *np.minimum(shares, best)])
-    left = max(1.0 - float(probabilities.sum()), 0.0)
-    return Decision(probabilities, left, best >= settings.threshold)
+    elsewhere = max(1.0 - float(probabilities.sum()), 0.0)
+    return Decision(probabilities, elsewhere, best >= settings.threshold)
+
+
+def _worths(fits: Fits) -> NDArray[np.float64]:
+    """Return (F,) what the fits are ordered by."""
+    return np.array([worth(*pair) for pair in fits.features[:, [_SCORE, _THROUGH]].tolist()])
 
 
 def _logistic(value: float) -> float:

@@ -85,7 +85,7 @@ class Answer:
         probability: What the method ordered its answers by; NaN when there was none.
         accepted: Whether the method itself stands by the answer.
         seconds: Time for the query with all preprocessing.
-        covariance: (3, 3) of the pose, or None.
+        covariance: (3, 3) of the pose and, where it is known, of the truth; or None.
     """
 
     query: int

@@ -90,10 +90,12 @@ PRESETS: Mapping[str, Mapping[str, Any]] = types.MappingProxyType(
                 "rays": 180,
             },
             "decision": {
-                "constant": 1.02,
-                "log_margin": 1.39,
-                "explained": 2.55,
-                "through": -6.2,
+                "constant": -4.35,
+                "log_margin": 1.38,
+                "explained": 1.17,
+                "through": -4.43,
+                "heading": 0.78,
+                "anchors": 0.42,
             },
         },
     }

@@ -42,7 +42,7 @@ class MapSearch:
     Args:
         votes: Of the candidate references, best first; None where all may propose.
         proposals: Alignments that passed the first check.
-        fits: What is left after all sieves, best score first.
+        fits: What is left after all sieves, of the highest worth first.
         decision: What they are worth.
         references: Those that the hypotheses name, one for each.
         hypotheses: Best first.
@@ -157,7 +157,7 @@ class StitchedMap:
         if not len(proposed.poses):
             proposed = _standing(content)
         fits = verify(proposed.poses, points, tiles, self._weights, settings.verification)
-        decision = decide(fits, settings.decision)
+        decision = decide(fits, len(description.anchors), settings.decision)
         hypotheses = self._hypotheses(description, fits, decision, content)
         references = tuple(content.known[each.reference].reference for each in hypotheses)
         return MapSearch(votes, proposed, fits, decision, references, hypotheses)

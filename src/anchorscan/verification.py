@@ -7,6 +7,13 @@ What is left is a handful of *fits*, each with the numbers that the decision nee
 
 The last numbers are the paper's e_m seen from the map: the share of readings that agree,
 and, beyond the paper, the shares that see through the map or that the map sees through.
+Fits are ordered by their *worth*: what the map leaves unexplained and what it contradicts,
+
+    -log(1 - s) - sqrt(through),
+
+with the score ``s`` and the share of rays that pass through known surfaces.  Where references
+are sparse and little of a scan can be explained, a wrong pose explains as much by chance, and
+often from behind a wall; where they are dense, a door that was opened since costs little.
 """
 
 from __future__ import annotations
@@ -31,10 +38,12 @@ from .field import (
 )
 from .proposal import spread
 
-__all__ = ["FEATURES", "Fits", "VerificationSettings", "follow", "verify"]
+__all__ = ["FEATURES", "Fits", "VerificationSettings", "follow", "verify", "worth"]
 
 # What is told of every fit: shares of the readings.
 FEATURES = ("score", "near", "close", "free", "unknown", "through", "off")
+# Scores above this are one: what is left is noise.
+_LARGEST_SCORE = 0.995
 
 
 class VerificationSettings(BaseModel):
@@ -57,16 +66,13 @@ class VerificationSettings(BaseModel):
         math.radians(20.0), gt=0.0, description="fits turned less are one place, radians"
     )
     last_readings: int = Field(120, ge=4, description="readings of the last numbers")
-    followed: int = Field(
-        2, ge=1, description="best fits whose rays are followed; the others' share is NaN"
-    )
     rays: int = Field(45, ge=4, description="rays followed through the map")
     through_margin: float = Field(0.3, gt=0.0, description="end of a ray that may touch, metres")
 
 
 @dataclass(frozen=True, eq=False)
 class Fits:
-    """Refined poses, best score first.
+    """Refined poses, of the highest worth first.
 
     Args:
         poses: (F, 3) T_set_laser, metres and radians.
@@ -123,7 +129,7 @@ def verify(
     )
     chosen = _sieve(poses, points, tiles, weights, sieves)
     places = (settings.place_distance, settings.place_turn)
-    rays = (settings.rays, settings.through_margin, settings.followed)
+    rays = (settings.rays, settings.through_margin)
     steps = (settings.fit_readings, settings.iterations, settings.last_readings)
     readings = min(len(points), settings.last_readings)
     found = _fit(chosen, points, tiles, weights, steps, places, rays)
@@ -162,6 +168,12 @@ def follow(
     moved, features, hessians, residuals = found
     readings = min(len(points), settings.last_readings)
     return Fits(moved, features, hessians, residuals, readings)
+
+
+@kernel
+def worth(score, through):  # type: ignore[no-untyped-def]
+    """What fits are ordered by, of a score and the share of rays that pass through surfaces."""
+    return -math.log(1.0 - min(score, _LARGEST_SCORE)) - math.sqrt(through)
 
 
 @kernel
@@ -223,26 +235,26 @@ def _features(pose, points, tiles, weights, numbers):  # type: ignore[no-untyped
 
 @kernel
 def _fit(poses, points, tiles, weights, steps, places, rays):  # type: ignore[no-untyped-def]
-    """Refine every pose and take the numbers of each place, best score first."""
+    """Refine every pose and take the numbers of each place, of the highest worth first."""
     count = len(poses)
     moved = np.empty((count, 3))
     features = np.empty((count, 7))
+    worths = np.empty(count)
     few = spread(points, steps[0])
     many = spread(points, steps[2])
+    followed = spread(points, rays[0])
     for k in range(count):
         moved[k] = refined(poses[k], few, tiles, steps[1])
         moved[k, 2] = wrapped(moved[k, 2])
         _features(moved[k], many, tiles, weights, features[k])
-    order = np.argsort(-features[:, 0], kind="mergesort")
+        features[k, 5] = passed_through(moved[k], followed, tiles, rays[1])
+        worths[k] = worth(features[k, 0], features[k, 5])
+    order = np.argsort(-worths, kind="mergesort")
     order = order[_distinct(moved[order], places[0], places[1], count)]
     moved, features = moved[order], features[order]
     hessians = np.empty((len(order), 3, 3))
     residuals = np.empty(len(order))
-    followed = spread(points, rays[0])
     for k in range(len(order)):
-        features[k, 5] = (
-            passed_through(moved[k], followed, tiles, rays[1]) if k < rays[2] else np.nan
-        )
         hessian, _, squares, total = normal_equations(moved[k], few, tiles, 0.1)
         hessians[k] = hessian
         residuals[k] = squares / max(total, 1.0)
