@@ -109,7 +109,8 @@ def execute(target: Target, data: bytes, folder: Path) -> None:
 
 def _one_line(error: Exception) -> None:
     message = str(error)
-    assert message and "\n" not in message, f"not one line: {message!r}"
+    assert message
+    assert "\n" not in message, f"not one line: {message!r}"
     assert len(message) < 2000, f"a message of {len(message)} characters"
 
 
@@ -308,7 +309,8 @@ def _map(data: bytes, folder: Path) -> None:
     except LogError as error:
         _one_line(error)
         return
-    assert grid.resolution > 0.0 and grid.origin.is_finite()
+    assert grid.resolution > 0.0
+    assert grid.origin.is_finite()
     assert ((grid.data >= -1) & (grid.data <= 100)).all()
 
 
@@ -320,7 +322,8 @@ def _map_scans(data: bytes, folder: Path) -> None:
     (folder / "m.pgm").write_bytes(image)
     try:
         for record in islice(reference_scans(load_map(path)), 3):
-            assert record.pose is not None and record.pose.is_finite()
+            assert record.pose is not None
+            assert record.pose.is_finite()
     except AnchorscanError as error:
         _one_line(error)
 
@@ -349,7 +352,8 @@ def _check_hypothesis(hypothesis: object) -> None:
     assert pose is None or pose.is_finite()
     assert hypothesis.pose_in_reference.is_finite()  # type: ignore[attr-defined]
     assert 0.0 <= hypothesis.probability <= 1.0  # type: ignore[attr-defined]
-    assert np.isfinite(spread).all() and (np.linalg.eigvalsh(spread) > -1e-9).all()
+    assert np.isfinite(spread).all()
+    assert (np.linalg.eigvalsh(spread) > -1e-9).all()
     assert 0.0 <= hypothesis.evaluation <= 1.0  # type: ignore[attr-defined]
 
 
