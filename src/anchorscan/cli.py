@@ -202,7 +202,7 @@ TopicOption = Annotated[
 ]
 UpsideDownOption = Annotated[
     bool,
-    typer.Option("--upside-down", help="The laser of a ROS recording hangs with its z axis down."),
+    typer.Option("--upside-down", help="The laser hangs with its z axis down."),
 ]
 PresetOption = Annotated[
     str | None,
@@ -324,7 +324,7 @@ def locate(
         records = _progress(records, "locating", opened.count)
     accepted = unusable = count = 0
     with _writing(output) as stream:
-        for line in _located(records, set_file, settings, candidates, processes):
+        for line in _located(records, set_file, settings, candidates, processes, opened):
             stream.write(json.dumps(line, allow_nan=False) + "\n")
             stream.flush()
             count += 1
@@ -465,7 +465,7 @@ def track(
         records = _progress(records, "tracking", opened.count)
     accepted = count = 0
     with _writing(output) as stream:
-        for line in _tracked(records, set_file, settings):
+        for line in _tracked(records, set_file, settings, opened):
             stream.write(json.dumps(line, allow_nan=False) + "\n")
             stream.flush()
             count += 1
@@ -644,6 +644,26 @@ def info(
     for name, value in facts.items():
         if value is not None:
             typer.echo(f"{name.replace('_', ' ') + ':':<13}{_in_words(name, value)}")
+
+
+@app.command()
+@_guarded
+def check(
+    set_file: SetArgument,
+    preset: PresetOption = None,
+    settings_file: SettingsOption = None,
+) -> None:
+    """Name the references that contradict the others: wrong poses, or places that have changed.
+
+    The exit code is 1 when there are any.
+    """
+    from .reference_set import ReferenceSet
+    from .set_check import run
+
+    with ReferenceSet.open(set_file, settings=_read_settings(preset, settings_file)) as places:
+        bad = run(places, say=typer.echo, progress=_progress)
+    if bad:
+        raise typer.Exit(_FAILED)
 
 
 @app.command()
@@ -912,6 +932,36 @@ def ablate(
 
 @app.command()
 @_guarded
+def bench_wrong(
+    logs: Annotated[
+        list[str] | None,
+        typer.Argument(
+            metavar="[BUILDING=]LOG...", help="Logs with poses; those in ANCHORSCAN_DATA if none."
+        ),
+    ] = None,
+    preset: PresetOption = None,
+    settings_file: SettingsOption = None,
+    queries: Annotated[
+        int, typer.Option(min=1, metavar="N", help="At most so many queries of each split.")
+    ] = 150,
+    seed: Annotated[int, typer.Option(help="Chooses queries and misplaced references.")] = 1,
+) -> None:
+    """Say what happens with wrong data of right syntax: a table in Markdown.
+
+    Accepted and correct answers with the laser upside down, with a twentieth of the references
+    misplaced, and in maps of the wrong scale; and whether it was noticed.
+    """
+    from . import benchmark, wrong_data
+
+    settings = _read_settings(preset or (None if settings_file else "default"), settings_file)
+    assert settings is not None
+    drives = benchmark.read_drives(logs or benchmark.default_logs(_say))
+    cases = list(benchmark.tasks(drives, ("P1", "P3")))
+    wrong_data.run(cases, settings, queries, seed, typer.echo, _progress)
+
+
+@app.command()
+@_guarded
 def change(
     logs: Annotated[
         list[str] | None,
@@ -1162,12 +1212,37 @@ def _open_log(path: Path, options: dict[str, Any]) -> Log:
 
 
 def _records(*logs: Log) -> Iterator[Record]:
-    """Read logs one after the other, and say what was guessed and what was malformed."""
+    """Read logs one after the other; say what was guessed, malformed, or cannot be meant."""
+    from .plausibility import Plausibility
+
     for log in logs:
         for note in log.notes:
             _say(f"note: {log.path}: {note}")
-        yield from log
+        plausibility = Plausibility()
+        for record in log:
+            plausibility.add(record)
+            yield record
         _report_problems(log)
+        for doubt in plausibility.doubts():
+            _say(f"warning: {log.path}: {doubt}")
+
+
+def _refuse_mirrored(places: ReferenceSet, log: Log) -> None:
+    """End where a laser hangs upside down and nobody said so: its answers would be wrong.
+
+    Raises:
+        LogError: The scans fit the set as their mirror images.
+    """
+    from .plausibility import mirror_check
+
+    found = mirror_check(places, log)
+    if found.is_mirrored:
+        raise LogError(
+            f"its scans fit the set as their mirror images ({found.mirrored} of "
+            f"{found.mirrored + found.as_given} that fit at all): one of the two was recorded with "
+            "the laser upside down, or was said to be (--upside-down)",
+            log.path,
+        )
 
 
 def _map_records(
@@ -1293,16 +1368,16 @@ class _Locator:
     def __init__(self, set_file: Path, settings: Settings | None, candidates: Any) -> None:
         from .reference_set import ReferenceSet
 
-        self._places: ReferenceSet = ReferenceSet.open(set_file, settings=settings)
+        self.places: ReferenceSet = ReferenceSet.open(set_file, settings=settings)
         self._candidates = candidates
-        self._places.prepare()
+        self.places.prepare()
 
     def line(self, record: Record) -> dict[str, Any]:
         """Return the line of ``locate`` for a record."""
         hypotheses: list[Hypothesis] = []
         start = time.perf_counter()
         if record.scan is not None:
-            hypotheses = self._places.locate(record.scan, self._candidates)
+            hypotheses = self.places.locate(record.scan, self._candidates)
         seconds = time.perf_counter() - start
         line: dict[str, Any] = {
             "scan": record.index,
@@ -1318,7 +1393,7 @@ class _Locator:
     def _reason(self, record: Record) -> str:
         if record.scan is None:
             return record.problem
-        return "no reading is a return" if len(self._places) else "the set has no references"
+        return "no reading is a return" if len(self.places) else "the set has no references"
 
 
 def _which_line(fleet: Fleet, record: Record, threads: int) -> dict[str, Any]:
@@ -1340,7 +1415,7 @@ def _which_line(fleet: Fleet, record: Record, threads: int) -> dict[str, Any]:
 
 
 def _tracked(
-    records: Iterable[Record], set_file: Path, settings: Settings | None
+    records: Iterable[Record], set_file: Path, settings: Settings | None, log: Log
 ) -> Iterator[dict[str, Any]]:
     """Yield the line of ``track`` for every record."""
     from .localizer import Localizer
@@ -1348,6 +1423,7 @@ def _tracked(
 
     places = ReferenceSet.open(set_file, settings=settings)
     places.prepare()
+    _refuse_mirrored(places, log)
     localizer = Localizer(places)
     localizer.prepare()
     for record in records:
@@ -1408,9 +1484,11 @@ def _located(
     settings: Settings | None,
     candidates: Any,
     processes: int,
+    log: Log,
 ) -> Iterator[dict[str, Any]]:
     """Yield the lines of ``locate`` in the order of the records."""
     locator = _Locator(set_file, settings, candidates)
+    _refuse_mirrored(locator.places, log)
     if processes == 1:
         yield from map(locator.line, records)
         return

@@ -181,7 +181,7 @@ def _with_atheris(name: str, options: argparse.Namespace, folder: Path) -> int:
         f"-seed={options.seed}",
         f"-artifact_prefix={options.findings.absolute()}/{name}-stopped-",
         "-verbosity=0",
-        "-timeout=20",
+        "-timeout=900",
     ]
 
     def take(data: bytes) -> None:

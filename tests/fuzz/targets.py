@@ -109,7 +109,8 @@ def execute(target: Target, data: bytes, folder: Path) -> None:
 
 def _one_line(error: Exception) -> None:
     message = str(error)
-    assert message and "\n" not in message, f"not one line: {message!r}"
+    assert message
+    assert "\n" not in message, f"not one line: {message!r}"
     assert len(message) < 2000, f"a message of {len(message)} characters"
 
 
@@ -264,7 +265,9 @@ def _sealed(data: bytes, folder: Path) -> None:
         connection.execute("BEGIN")
         seal = _seal(identifier, readings, *geometry, *pose, title, data=ranges)
         try:
-            connection.execute("INSERT INTO sensor VALUES (1, ?, ?, ?, ?, ?)", (readings, *geometry))
+            connection.execute(
+                "INSERT INTO sensor VALUES (1, ?, ?, ?, ?, ?)", (readings, *geometry)
+            )
             connection.execute(
                 "INSERT INTO reference VALUES (?, 1, ?, ?, ?, ?, ?, ?)",
                 (identifier, *pose, title, seal, ranges),
@@ -306,7 +309,8 @@ def _map(data: bytes, folder: Path) -> None:
     except LogError as error:
         _one_line(error)
         return
-    assert grid.resolution > 0.0 and grid.origin.is_finite()
+    assert grid.resolution > 0.0
+    assert grid.origin.is_finite()
     assert ((grid.data >= -1) & (grid.data <= 100)).all()
 
 
@@ -318,7 +322,8 @@ def _map_scans(data: bytes, folder: Path) -> None:
     (folder / "m.pgm").write_bytes(image)
     try:
         for record in islice(reference_scans(load_map(path)), 3):
-            assert record.pose is not None and record.pose.is_finite()
+            assert record.pose is not None
+            assert record.pose.is_finite()
     except AnchorscanError as error:
         _one_line(error)
 
@@ -347,7 +352,8 @@ def _check_hypothesis(hypothesis: object) -> None:
     assert pose is None or pose.is_finite()
     assert hypothesis.pose_in_reference.is_finite()  # type: ignore[attr-defined]
     assert 0.0 <= hypothesis.probability <= 1.0  # type: ignore[attr-defined]
-    assert np.isfinite(spread).all() and (np.linalg.eigvalsh(spread) > -1e-9).all()
+    assert np.isfinite(spread).all()
+    assert (np.linalg.eigvalsh(spread) > -1e-9).all()
     assert 0.0 <= hypothesis.evaluation <= 1.0  # type: ignore[attr-defined]
 
 
@@ -396,13 +402,24 @@ _LINES = (b"\n", b"\r\n", b"\r", b"\0", b"\xff", b"\xef\xbb\xbf", b"#", *_NUMBER
 _CARMEN = (b"FLASER", b"RLASER", b"ROBOTLASER1", b"PARAM", b"robot_frontlaser_offset", b"ODOM")
 _YAML = (b"&a", b"*a", b"<<: *a", b"!!python/object", b"!!binary", b"[", b"{", b"? ", b"|", b"---")
 _MAP = (b"image", b"m.pgm", b"resolution", b"origin", b"mode", b"raw", b"scale", b"trinary")
-_JSON = (b"{", b"[" * 50, b"null", b"NaN", b"Infinity", b'"method"', b'"field"', b"1e999", b"\\u0000")
+_JSON = (
+    b"{",
+    b"[" * 50,
+    b"null",
+    b"NaN",
+    b"Infinity",
+    b'"method"',
+    b'"field"',
+    b"1e999",
+    b"\\u0000",
+)
 _DOUBLES = tuple(
     struct.pack("<d", value)
     for value in (math.nan, math.inf, -math.inf, 1e308, -1e308, 5e-324, 0.0, -0.0, 1e-9, 7.0)
 )
 _FLOATS = tuple(
-    struct.pack("<f", value) for value in (math.nan, math.inf, -math.inf, 3e38, 1e-45, 0.0, -1.0, 80.0)
+    struct.pack("<f", value)
+    for value in (math.nan, math.inf, -math.inf, 3e38, 1e-45, 0.0, -1.0, 80.0)
 )
 
 TARGETS = {
@@ -410,9 +427,16 @@ TARGETS = {
     for target in (
         Target("carmen", seeds.carmen, _log, _LINES + _CARMEN),
         Target("g2o", seeds.g2o, _log, (*_LINES, b"VERTEX_SE2", b"EDGE_SE2", b"ROBOTLASER1")),
-        Target("csv", seeds.csv, _log, (*_LINES, b",", b";", b"\t", b"r0", b"ranges[1]", b"x", b"theta")),
+        Target(
+            "csv",
+            seeds.csv,
+            _log,
+            (*_LINES, b",", b";", b"\t", b"r0", b"ranges[1]", b"x", b"theta"),
+        ),
         Target("tum", seeds.tum, _tum, _LINES),
-        Target("numpy", seeds.numpy_files, _numpy, (seeds.SEPARATOR, b"'descr'", b"'|O'", *_NUMBERS)),
+        Target(
+            "numpy", seeds.numpy_files, _numpy, (seeds.SEPARATOR, b"'descr'", b"'|O'", *_NUMBERS)
+        ),
         Target("archive", seeds.archives, _archive, (*_LINES, b"PK\1\2", b"PK\3\4", b"PK\5\6")),
         Target("answers", seeds.answers, _answers, _JSON),
         Target("bag", seeds.bags, _bag, (b"op=\2", b"\xff\xff\xff\xff", b"\x89MCAP0\r\n")),
@@ -420,7 +444,9 @@ TARGETS = {
         Target("bag-message", seeds.messages, _message, _FLOATS),
         Target("set", seeds.sets, _set, (b"CREATE", b"TRIGGER", b"SQLite format 3\0")),
         Target("set-sealed", seeds.sealed, _sealed, (seeds.SEPARATOR, *_DOUBLES, *_FLOATS)),
-        Target("set-directory", seeds.directories, _directory, (seeds.SEPARATOR, *_JSON, *_NUMBERS)),
+        Target(
+            "set-directory", seeds.directories, _directory, (seeds.SEPARATOR, *_JSON, *_NUMBERS)
+        ),
         Target("map", seeds.maps, _map, (seeds.SEPARATOR, *_YAML, *_MAP, *_NUMBERS)),
         Target("map-scans", seeds.maps, _map_scans, (seeds.SEPARATOR, *_MAP, *_NUMBERS)),
         Target("settings", seeds.settings, _settings, _JSON),

@@ -21,6 +21,7 @@ from .posed_log import Body, PosedLog
 from .rosbag import BagLog, BagOptions, find_bag
 from .text import TextFile, find_text
 from .tum import write_tum
+from .turned_log import TurnedLog
 
 __all__ = ["Log", "Problem", "open_log", "write_tum"]
 
@@ -66,8 +67,8 @@ def open_log(
             one.
         T_base_laser: Where the laser sits on the robot, instead of what a ROS recording or a
             CARMEN log says; for ``poses`` of the base, of any log.
-        is_upside_down: Whether the laser of a ROS recording hangs with its z axis down,
-            instead of what /tf says.
+        is_upside_down: Whether the laser hangs with its z axis down, instead of what a ROS
+            recording says in /tf; all others hold scans as if it stood.
         base_frame_id: Name of the robot's base in /tf; else that of the odometry, or the usual
             ones.
         global_frame_id: Name of the map in /tf.
@@ -106,6 +107,7 @@ def open_log(
     if path.is_dir():
         raise LogError("is a folder without a recording in it", path)
     log = _open_file(path, magic, field_of_view, range_max, pose_columns, T_base_laser)
+    log = TurnedLog(log) if is_upside_down else log
     if poses is None:
         return log
     tum = _tum_file(poses, path)

@@ -1,0 +1,37 @@
+"""A log whose laser hung upside down without the log saying so."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+from ..record import Record
+from ..scan import LaserScan
+from .log import Log, Report
+
+__all__ = ["TurnedLog"]
+
+
+class TurnedLog(Log):
+    """A log with every scan turned over: angles change sign, poses stay as they are.
+
+    Args:
+        log: The log as it was recorded.
+    """
+
+    def __init__(self, log: Log) -> None:
+        super().__init__(log.path)
+        self._log = log
+        self.format = log.format
+        self.count = log.count
+        self.notes = (*log.notes, "the laser hangs upside down, as was said")
+
+    def _read(self, report: Report) -> Iterator[Record]:
+        for record in self._log.records(report):
+            scan = record.scan
+            yield record if scan is None else replace(record, scan=_turned(scan))
+
+
+def _turned(scan: LaserScan) -> LaserScan:
+    start, increment = -scan.angle_min, -scan.angle_increment
+    return LaserScan(scan.ranges, start, increment, scan.range_min, scan.range_max)

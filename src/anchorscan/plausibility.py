@@ -1,0 +1,179 @@
+"""Data that is well formed and yet cannot be meant: units, clocks, and lasers upside down.
+
+A reader takes what is written.  Here a whole recording is looked at for what no robot does:
+
+* every reading beyond the sensor's limit, or walls hundreds of metres away: millimetres;
+* steps of tens of metres from scan to scan: positions in millimetres;
+* headings that have nothing to do with where the robot drives: degrees.  Robots drive along one
+  axis; twice the angle between heading and step is then nearly constant, however the laser is
+  mounted, and the length of its mean direction is 0.53 to 0.98 on the logs that this was tried
+  with, but 0.02 to 0.30 on the same with their headings in degrees;
+* times that repeat or run backwards;
+* scans that fit the map only as their mirror image: a laser that hangs upside down.
+
+All but the last need nothing but the recording.  One scan cannot tell the last: a room on the left
+of a corridor is the mirror image of one on the right.  Several scans can.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+from itertools import islice
+from statistics import median
+from typing import Protocol
+
+from .hypothesis import Hypothesis
+from .pose import Pose2D
+from .record import Record
+from .scan import LaserScan
+
+__all__ = ["MirrorCheck", "Plausibility", "mirror_check", "mirror_image"]
+
+_FEWEST = 5
+_MOST_STEPS = 10_000
+# Metres: no hall is as wide, and no robot drives as far between two scans.
+_WIDE_RANGE, _LONG_STEP = 150.0, 20.0
+# Steps of this length, metres, tell where a robot drives; so many, and so constant an angle.
+_SHORT_STEP, _NEAR_STEP = 0.05, 1.5
+_FEWEST_STEPS, _LEAST_CONSTANT = 30, 0.4
+# Scans that are asked both ways, of so many at the beginning.
+_LOOKED_AT, _ASKED = 400, 24
+_MIRRORED_SHARE = 0.7
+
+
+class Plausibility:
+    """Looks at the records of one recording as they go by, and holds a few numbers of them."""
+
+    def __init__(self) -> None:
+        self._scans = self._with_return = 0
+        self._limit = 0.0
+        self._ranges: list[float] = []
+        self._steps: list[float] = []
+        self._courses: list[complex] = []
+        self._pose: Pose2D | None = None
+        self._stamp: float | None = None
+        self._stamps = self._repeated = self._reversed = 0
+        self._first_wrong = 0
+
+    def add(self, record: Record) -> None:
+        """Look at the next record."""
+        if record.scan is not None:
+            self._add_scan(record.scan)
+        self._add_pose(record.pose if record.pose is not None else record.odometry)
+        self._add_stamp(record)
+
+    def doubts(self) -> list[str]:
+        """Return what cannot be meant, a line each."""
+        found = []
+        if self._scans >= _FEWEST and not self._with_return:
+            found.append(
+                f"no reading of its {self._scans} scans lies within the sensor's limit of "
+                f"{self._limit:g} m: are ranges in millimetres?"
+            )
+        elif self._ranges and median(self._ranges) > _WIDE_RANGE:
+            found.append(
+                f"half of the readings are longer than {median(self._ranges):.0f} m: are ranges in "
+                "millimetres?"
+            )
+        if len(self._steps) >= _FEWEST and median(self._steps) > _LONG_STEP:
+            found.append(
+                f"poses jump by {median(self._steps):.0f} m from scan to scan: are they in "
+                "millimetres?"
+            )
+        courses = self._courses
+        if len(courses) >= _FEWEST_STEPS and abs(sum(courses)) < _LEAST_CONSTANT * len(courses):
+            found.append(
+                "headings have nothing to do with where the robot drives: are they in degrees, not "
+                "radians, or does it drive in any direction?"
+            )
+        if wrong := self._repeated + self._reversed:
+            found.append(
+                f"{wrong} of {self._stamps} times do not follow the one before ({self._repeated} "
+                f"repeated, {self._reversed} backwards), the first at scan {self._first_wrong}"
+            )
+        return found
+
+    def _add_scan(self, scan: LaserScan) -> None:
+        self._scans += 1
+        self._limit = max(self._limit, scan.range_max)
+        returns = scan.ranges[scan.is_return]
+        if len(returns):
+            self._with_return += 1
+            if len(self._ranges) < _MOST_STEPS:
+                self._ranges.append(float(returns[len(returns) // 2]))
+
+    def _add_pose(self, pose: Pose2D | None) -> None:
+        before, self._pose = self._pose, pose
+        if pose is None or before is None or len(self._steps) >= _MOST_STEPS:
+            return
+        step = pose.distance(before)
+        if step > 0.0:
+            self._steps.append(step)
+            if _SHORT_STEP < step < _NEAR_STEP:
+                course = math.atan2(pose.y - before.y, pose.x - before.x) - before.theta
+                self._courses.append(complex(math.cos(2.0 * course), math.sin(2.0 * course)))
+
+    def _add_stamp(self, record: Record) -> None:
+        if record.stamp is None:
+            return
+        self._stamps += 1
+        if self._stamp is not None and record.stamp <= self._stamp:
+            self._first_wrong = self._first_wrong or record.index
+            self._repeated += record.stamp == self._stamp
+            self._reversed += record.stamp < self._stamp
+        self._stamp = record.stamp
+
+
+class _Places(Protocol):
+    """What can say where a scan was taken: a matcher or a reference set."""
+
+    def locate(self, scan: LaserScan) -> list[Hypothesis]: ...
+
+
+@dataclass(frozen=True)
+class MirrorCheck:
+    """How many scans fit as they are, and how many as their mirror image.
+
+    Args:
+        as_given: Scans that are located, and fit at least as well as their mirror image.
+        mirrored: Scans whose mirror image is located, and fits better.
+    """
+
+    as_given: int
+    mirrored: int
+
+    @property
+    def is_mirrored(self) -> bool:
+        """Whether the scans are mirrored, beyond reasonable doubt."""
+        fitting = self.as_given + self.mirrored
+        return self.mirrored >= _FEWEST and self.mirrored >= _MIRRORED_SHARE * fitting
+
+
+def mirror_check(places: _Places, records: Iterable[Record]) -> MirrorCheck:
+    """Locate some scans of the beginning of a recording, each also as its mirror image.
+
+    Args:
+        places: Where they are sought.
+        records: The recording, from its beginning.
+    """
+    scans = [record.scan for record in islice(records, _LOOKED_AT) if record.scan is not None]
+    as_given = mirrored = 0
+    for scan in scans[:: max(1, len(scans) // _ASKED)]:
+        here, there = places.locate(scan)[:1], places.locate(mirror_image(scan))[:1]
+        if not (here and there):
+            continue
+        better, is_mirrored = here[0], False
+        if there[0].score > here[0].score:
+            better, is_mirrored = there[0], True
+        as_given += better.accepted and not is_mirrored
+        mirrored += better.accepted and is_mirrored
+    return MirrorCheck(as_given, mirrored)
+
+
+def mirror_image(scan: LaserScan) -> LaserScan:
+    """Return what a laser sees that hangs upside down without anybody knowing."""
+    return LaserScan(
+        scan.ranges, -scan.angle_min, -scan.angle_increment, scan.range_min, scan.range_max
+    )

@@ -1,0 +1,151 @@
+"""``anchorscan check``: which references of a set contradict the others.
+
+Every reference is taken out of the map, compared with what the others show at its own pose, and
+located among them.  One that fits clearly better somewhere else was put into the set with a wrong
+pose; so, in all likelihood, was one whose readings end where the others saw no surface.  A place
+that no other reference has seen cannot be judged.
+
+Wrong poses in a twentieth of the references do not make answers wrong, since the others outvote
+them (figures in the documentation); they make them less sure.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from typing import Literal, Protocol, TypeVar
+
+import numpy as np
+
+from .errors import ReferenceSetError
+from .matcher import Matcher
+from .pose import Pose2D
+from .reference import Reference
+from .reference_set import ReferenceSet
+from .verification import FEATURES
+
+__all__ = ["ReferenceCheck", "Verdict", "check", "run"]
+
+Item = TypeVar("Item")
+Verdict = Literal["sound", "misplaced", "contradicted", "alone"]
+
+_NEAR, _UNKNOWN = FEATURES.index("near"), FEATURES.index("unknown")
+# A pose that is off by less is no wrong one: what counts as correct, doubled in heading.
+_AWAY, _TURNED = 0.5, math.radians(20.0)
+# Shares of the readings; chosen on intel, freiburg-079 and wean, the others had no part in that.
+_CLEARLY_BETTER = 0.2
+_TOO_FEW_NEAR = 0.6
+_UNSEEN = 0.5
+
+
+class ProgressOf(Protocol):
+    """How the caller shows progress: passes items on."""
+
+    def __call__(
+        self, items: Iterable[Item], what: str, total: int | None = None
+    ) -> Iterable[Item]: ...
+
+
+@dataclass(frozen=True, eq=False)
+class ReferenceCheck:
+    """What the other references say of one.
+
+    Args:
+        reference: The reference.
+        verdict: "sound"; "misplaced", it fits elsewhere; "contradicted", it does not fit where
+            it is said to be, nor surely elsewhere; "alone", no other has seen its place.
+        near: Share of its readings that end within 10 cm of a surface that others saw.
+        elsewhere: ``T_set_laser`` where it fits, if it is misplaced.
+        near_elsewhere: Share of the readings near a surface there; NaN if it is not misplaced.
+    """
+
+    reference: Reference
+    verdict: Verdict
+    near: float
+    elsewhere: Pose2D | None = None
+    near_elsewhere: float = math.nan
+
+    def __str__(self) -> str:
+        """Say it in one line."""
+        reference = self.reference
+        name = f" ({reference.name})" if reference.name else ""
+        pose = reference.pose
+        assert pose is not None
+        begin = f"reference {reference.identifier}{name} at {_place(pose)}: {self.verdict}"
+        if self.elsewhere is None:
+            return f"{begin}; {100.0 * self.near:.0f} % of its readings agree with the others"
+        away = pose.distance(self.elsewhere)
+        return (
+            f"{begin}; it fits at {_place(self.elsewhere)}, {away:.1f} m away: "
+            f"{100.0 * self.near_elsewhere:.0f} % of its readings agree there, "
+            f"{100.0 * self.near:.0f} % here"
+        )
+
+
+def check(
+    places: ReferenceSet,
+    progress: ProgressOf = lambda items, what, total=None: items,
+) -> Iterator[ReferenceCheck]:
+    """Compare every reference that has a pose with all others, in their order.
+
+    Args:
+        places: A set whose references are searched as one map.
+        progress: Wraps what takes a while.
+
+    Raises:
+        ReferenceSetError: Fewer than two references have a pose, or the settings ask for the
+            method of the paper, which has no map.
+    """
+    posed = [reference for reference in places.references if reference.pose is not None]
+    matcher = Matcher(posed, places.settings)
+    if len(posed) < 2 or not matcher.has_map:
+        raise ReferenceSetError(
+            f"{places.path or 'the set'}: only references with poses, searched as one map, can be "
+            f"compared with each other; here are {len(posed)} with a pose"
+        )
+    for reference in progress(posed, "checking", len(posed)):
+        matcher.remove(reference.identifier)
+        yield _judge(reference, matcher)
+        matcher.add(reference)
+
+
+def run(places: ReferenceSet, say: Callable[[str], None], progress: ProgressOf) -> int:
+    """Name the references that contradict the others, the worst first.
+
+    Returns:
+        How many are misplaced or contradicted.
+    """
+    found = list(check(places, progress))
+    bad = [each for each in found if each.verdict in ("misplaced", "contradicted")]
+    for each in sorted(bad, key=lambda each: (each.verdict != "misplaced", each.near)):
+        say(str(each))
+    alone = sum(each.verdict == "alone" for each in found)
+    say(
+        f"{len(found)} references: {len(found) - len(bad) - alone} agree with the others, "
+        f"{len(bad)} do not, {alone} cannot be judged because no other has seen their place"
+    )
+    return len(bad)
+
+
+def _judge(reference: Reference, others: Matcher) -> ReferenceCheck:
+    pose = reference.pose
+    assert pose is not None
+    if not reference.scan.is_return.any():
+        return ReferenceCheck(reference, "alone", math.nan)
+    here = others.follow(reference.scan, pose.to_array()[None], np.zeros((1, 3, 3)))
+    near, unknown = here.features[0, [_NEAR, _UNKNOWN]].tolist()
+    trace = others.explain(reference.scan)
+    best = trace.hypotheses[0] if trace.hypotheses else None
+    if best is not None and best.accepted and best.pose is not None and trace.in_map is not None:
+        near_there = float(trace.in_map.fits.features[0, _NEAR])
+        is_away = best.pose.distance(pose) > _AWAY or best.pose.turn(pose) > _TURNED
+        if is_away and near_there - near > _CLEARLY_BETTER:
+            return ReferenceCheck(reference, "misplaced", near, best.pose, near_there)
+    if unknown >= _UNSEEN:
+        return ReferenceCheck(reference, "alone", near)
+    return ReferenceCheck(reference, "contradicted" if near < _TOO_FEW_NEAR else "sound", near)
+
+
+def _place(pose: Pose2D) -> str:
+    return f"x {pose.x:.2f} m, y {pose.y:.2f} m, {math.degrees(pose.theta):.0f} degrees"
