@@ -53,7 +53,9 @@ class AngleFunctionSettings(BaseModel):
     noise: float = Field(0.05, ge=0.0, description="gap that noise alone can make, metres")
     largest_gap: float = Field(0.5, gt=0.0, description="no two readings connect across more")
     smallest_jump: float = Field(0.3, gt=0.0, description="range step that is a jump, metres")
-    bins: int = Field(180, ge=8, le=3600, description="bins of the angle histogram over 180 degrees")
+    bins: int = Field(
+        180, ge=8, le=3600, description="bins of the angle histogram over 180 degrees"
+    )
 
 
 @dataclass(frozen=True, eq=False)

@@ -59,8 +59,12 @@ class FieldSettings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     resolution: float = Field(0.05, ge=0.01, le=1.0, description="width of a cell, metres")
-    reach: float = Field(0.5, gt=0.0, le=3.0, description="distance to a surface that is told, metres")
-    farthest: float = Field(40.0, gt=0.0, le=1000.0, description="longer readings are left out, metres")
+    reach: float = Field(
+        0.5, gt=0.0, le=3.0, description="distance to a surface that is told, metres"
+    )
+    farthest: float = Field(
+        40.0, gt=0.0, le=1000.0, description="longer readings are left out, metres"
+    )
     margin: float = Field(0.15, ge=0.0, description="end of a ray that frees nothing, metres")
     fewest_passes: int = Field(2, ge=1, description="rays that make free space known")
     passes_per_hit: float = Field(2.0, gt=0.0, description="more passes, and it is no surface")

@@ -170,7 +170,9 @@ def _parse_yaml(path: Path) -> dict[Any, Any]:
         if sum(map(content.count, (b"[", b"{"))) > _MOST_BRACKETS:
             raise LogError("is not a map's YAML: it has too many brackets", path)
         # A few aliases of aliases stand for more than any memory holds.
-        if any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(content, yaml.SafeLoader)):
+        if any(
+            isinstance(event, yaml.AliasEvent) for event in yaml.parse(content, yaml.SafeLoader)
+        ):
             raise LogError("is not a map's YAML: it has aliases", path)
         raw = yaml.safe_load(content)
     except yaml.YAMLError as error:

@@ -33,7 +33,9 @@ def _flip(rng: random.Random, data: bytearray, *_: object) -> None:
 
 def _set(rng: random.Random, data: bytearray, *_: object) -> None:
     if data:
-        data[rng.randrange(len(data))] = rng.choice((0, 1, 9, 10, 32, 127, 128, 255, rng.randrange(256)))
+        data[rng.randrange(len(data))] = rng.choice(
+            (0, 1, 9, 10, 32, 127, 128, 255, rng.randrange(256))
+        )
 
 
 def _delete(rng: random.Random, data: bytearray, *_: object) -> None:
@@ -62,7 +64,16 @@ def _number(rng: random.Random, data: bytearray, seeds: object, words: Sequence[
     if found:
         match = rng.choice(found)
         data[match.start() : match.end()] = rng.choice(
-            (b"0", b"-1", b"1000000000", b"9" * 40, b"1e400", b"nan", b"0.5", str(rng.random()).encode())
+            (
+                b"0",
+                b"-1",
+                b"1000000000",
+                b"9" * 40,
+                b"1e400",
+                b"nan",
+                b"0.5",
+                str(rng.random()).encode(),
+            )
         )
 
 

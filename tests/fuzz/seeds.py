@@ -86,7 +86,9 @@ def csv() -> list[bytes]:
     names = "stamp,x,y,theta,angle_min,angle_increment,range_max,r0,r1,r2,r3"
     rows = "".join(f"\n{i},{i},0.5,0.1,-0.5,0.25,8,1,2,,inf" for i in range(3))
     plain = "\n".join(" ".join(["1.5"] * 181) for _ in range(2))
-    echo = "%time,field.header.stamp,field.angle_min,field.angle_increment,field.ranges0,field.ranges1"
+    echo = (
+        "%time,field.header.stamp,field.angle_min,field.angle_increment,field.ranges0,field.ranges1"
+    )
     texts = [names + rows, (names + rows).replace(",", ";"), (names + rows).replace(",", "\t")]
     texts += [plain, echo + "\n1e18,1e18,-1,0.5,1,2\n"]
     return [text.encode() for text in texts]
@@ -115,7 +117,12 @@ def numpy_files() -> list[bytes]:
         *(_npy(-0.5), _npy(np.full(3, 0.1)), _npy(np.ones(3))),
     ]
     fortran = _npy(np.asfortranarray(np.ones((3, 181), np.uint16)))
-    return [_npy(np.ones((2, 181), ">f8")), fortran, SEPARATOR.join(members), SEPARATOR.join(members[:2])]
+    return [
+        _npy(np.ones((2, 181), ">f8")),
+        fortran,
+        SEPARATOR.join(members),
+        SEPARATOR.join(members[:2]),
+    ]
 
 
 def archives() -> list[bytes]:

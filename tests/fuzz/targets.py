@@ -264,7 +264,9 @@ def _sealed(data: bytes, folder: Path) -> None:
         connection.execute("BEGIN")
         seal = _seal(identifier, readings, *geometry, *pose, title, data=ranges)
         try:
-            connection.execute("INSERT INTO sensor VALUES (1, ?, ?, ?, ?, ?)", (readings, *geometry))
+            connection.execute(
+                "INSERT INTO sensor VALUES (1, ?, ?, ?, ?, ?)", (readings, *geometry)
+            )
             connection.execute(
                 "INSERT INTO reference VALUES (?, 1, ?, ?, ?, ?, ?, ?)",
                 (identifier, *pose, title, seal, ranges),
@@ -396,13 +398,24 @@ _LINES = (b"\n", b"\r\n", b"\r", b"\0", b"\xff", b"\xef\xbb\xbf", b"#", *_NUMBER
 _CARMEN = (b"FLASER", b"RLASER", b"ROBOTLASER1", b"PARAM", b"robot_frontlaser_offset", b"ODOM")
 _YAML = (b"&a", b"*a", b"<<: *a", b"!!python/object", b"!!binary", b"[", b"{", b"? ", b"|", b"---")
 _MAP = (b"image", b"m.pgm", b"resolution", b"origin", b"mode", b"raw", b"scale", b"trinary")
-_JSON = (b"{", b"[" * 50, b"null", b"NaN", b"Infinity", b'"method"', b'"field"', b"1e999", b"\\u0000")
+_JSON = (
+    b"{",
+    b"[" * 50,
+    b"null",
+    b"NaN",
+    b"Infinity",
+    b'"method"',
+    b'"field"',
+    b"1e999",
+    b"\\u0000",
+)
 _DOUBLES = tuple(
     struct.pack("<d", value)
     for value in (math.nan, math.inf, -math.inf, 1e308, -1e308, 5e-324, 0.0, -0.0, 1e-9, 7.0)
 )
 _FLOATS = tuple(
-    struct.pack("<f", value) for value in (math.nan, math.inf, -math.inf, 3e38, 1e-45, 0.0, -1.0, 80.0)
+    struct.pack("<f", value)
+    for value in (math.nan, math.inf, -math.inf, 3e38, 1e-45, 0.0, -1.0, 80.0)
 )
 
 TARGETS = {
@@ -410,9 +423,16 @@ TARGETS = {
     for target in (
         Target("carmen", seeds.carmen, _log, _LINES + _CARMEN),
         Target("g2o", seeds.g2o, _log, (*_LINES, b"VERTEX_SE2", b"EDGE_SE2", b"ROBOTLASER1")),
-        Target("csv", seeds.csv, _log, (*_LINES, b",", b";", b"\t", b"r0", b"ranges[1]", b"x", b"theta")),
+        Target(
+            "csv",
+            seeds.csv,
+            _log,
+            (*_LINES, b",", b";", b"\t", b"r0", b"ranges[1]", b"x", b"theta"),
+        ),
         Target("tum", seeds.tum, _tum, _LINES),
-        Target("numpy", seeds.numpy_files, _numpy, (seeds.SEPARATOR, b"'descr'", b"'|O'", *_NUMBERS)),
+        Target(
+            "numpy", seeds.numpy_files, _numpy, (seeds.SEPARATOR, b"'descr'", b"'|O'", *_NUMBERS)
+        ),
         Target("archive", seeds.archives, _archive, (*_LINES, b"PK\1\2", b"PK\3\4", b"PK\5\6")),
         Target("answers", seeds.answers, _answers, _JSON),
         Target("bag", seeds.bags, _bag, (b"op=\2", b"\xff\xff\xff\xff", b"\x89MCAP0\r\n")),
@@ -420,7 +440,9 @@ TARGETS = {
         Target("bag-message", seeds.messages, _message, _FLOATS),
         Target("set", seeds.sets, _set, (b"CREATE", b"TRIGGER", b"SQLite format 3\0")),
         Target("set-sealed", seeds.sealed, _sealed, (seeds.SEPARATOR, *_DOUBLES, *_FLOATS)),
-        Target("set-directory", seeds.directories, _directory, (seeds.SEPARATOR, *_JSON, *_NUMBERS)),
+        Target(
+            "set-directory", seeds.directories, _directory, (seeds.SEPARATOR, *_JSON, *_NUMBERS)
+        ),
         Target("map", seeds.maps, _map, (seeds.SEPARATOR, *_YAML, *_MAP, *_NUMBERS)),
         Target("map-scans", seeds.maps, _map_scans, (seeds.SEPARATOR, *_MAP, *_NUMBERS)),
         Target("settings", seeds.settings, _settings, _JSON),
