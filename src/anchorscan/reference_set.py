@@ -391,6 +391,8 @@ class ReferenceSet:
         if self.path is None:
             return False
         with self._lock:
+            if self._file is not None:  # another file would be read with this one's log
+                self._file.check()
             content = read_set(self.path)
             fresh = {reference.identifier: reference for reference in content.references}
             old = self._references

@@ -175,10 +175,10 @@ class Robot:
             T_base_laser: Where the laser sits.
 
         Returns:
-            None for a scan that came too late or twice.
+            None for a scan that came too late or twice, or at no time.
         """
         self.watch_clock(stamp)
-        if stamp <= self._last:
+        if not self._last < stamp < math.inf:
             self.late += 1
             return None
         self._last = stamp

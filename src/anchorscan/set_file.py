@@ -255,6 +255,7 @@ class SetFile:
             _check_file(path)
             self._connection = _connect(path, "mode=rw")
             self._identity = _hold(path)
+            self._size = path.stat().st_size
             # Runs at the end of the process too: a set that nobody closed is one file even so.
             self._finish = weakref.finalize(
                 self, _abandon, self._connection, path, self._identity, os.getpid()
@@ -339,15 +340,45 @@ class SetFile:
             header = _load_header(connection)
             _store_header(connection, replace(header, name=name, settings=settings))
 
+    def check(self) -> None:
+        """See that the path still leads to the file that was opened.
+
+        SQLite goes on writing to a file that was removed, where nobody will ever read it.
+
+        Raises:
+            ReferenceSetError: The file was removed, replaced or cut short meanwhile.
+        """
+        try:
+            found = self.path.stat()
+            is_whole = found.st_size >= self._size
+            happened = None if is_whole else "cut short"
+            if (found.st_dev, found.st_ino) != self._identity:
+                happened = "replaced by another file"
+        except OSError:
+            happened = "removed"
+        if happened is not None:
+            raise ReferenceSetError(
+                f"{self.path}: was {happened} while it was open to be changed; save the set under "
+                f"another name, close it, and open what is to be used"
+            )
+
     def close(self) -> None:
         """Fold the write-ahead log in, so that the file stands alone, and let go of it.
 
         Raises:
             ReferenceSetError: The log could not be folded in and stays beside the file; nothing
-                is lost, the next opening tries again.
+                is lost, the next opening tries again.  Or the file was removed, replaced or cut
+                short meanwhile.
         """
-        if self._finish.detach() is not None:
-            _fold_in(self._connection, self.path, self._identity)
+        if self._finish.detach() is None:
+            return
+        try:
+            self.check()
+        except ReferenceSetError:
+            self._connection.close()  # takes the log along, which belongs to no file any more
+            _release(self._identity)
+            raise
+        _fold_in(self._connection, self.path, self._identity)
 
     def __enter__(self) -> SetFile:
         return self
@@ -357,6 +388,7 @@ class SetFile:
 
     @contextmanager
     def _transaction(self) -> Iterator[sqlite3.Connection]:
+        self.check()
         self._connection.execute("BEGIN IMMEDIATE")
         try:
             yield self._connection
