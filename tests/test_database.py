@@ -145,6 +145,13 @@ class ChangingDatabase(RuleBasedStateMachine):
         del self.model[identifier]
         self.database.remove(identifier)
 
+    @rule()
+    def write_and_read(self):
+        arrays = self.database.arrays()
+        for array in arrays.values():
+            array.flags.writeable = False  # as if mapped from a file
+        self.database = RelationshipDatabase.from_arrays(self.settings, arrays)
+
     @invariant()
     def votes_as_built_at_once(self):
         at_once = RelationshipDatabase(self.settings, self.model.items())
@@ -186,6 +193,59 @@ class ChangingOrientedDatabase(ChangingDatabase):
 TestChangingDatabase = ChangingDatabase.TestCase
 TestChangingLargeDatabase = ChangingLargeDatabase.TestCase
 TestChangingOrientedDatabase = ChangingOrientedDatabase.TestCase
+
+
+def oriented_graph(seed):
+    return ChangingOrientedDatabase.graph(seed)
+
+
+@pytest.mark.parametrize(
+    ("name", "changed"),
+    [
+        ("keys", lambda a: a[::-1].copy()),
+        ("keys", lambda a: a.astype(np.int64)),
+        ("starts", lambda a: a[:-1]),
+        ("starts", lambda a: a + np.uint32(1)),
+        ("postings", lambda a: a + np.uint32(4 * 100)),
+        ("postings", lambda a: a[:-1]),
+        ("sizes", lambda a: a[:-1]),
+        ("sizes", lambda a: -a - 1),
+        ("identifiers", lambda a: np.zeros_like(a)),
+        ("identifiers", lambda a: None),
+        ("slots", lambda a: a + np.int32(100)),
+        ("slots", lambda a: a - np.int32(100)),
+        ("lengths", lambda a: a[::-1].copy()),
+        ("lengths", lambda a: None),
+    ],
+)
+def test_arrays_that_do_not_fit_together_are_refused(name, changed):
+    for settings in (by_length(), DatabaseSettings()):
+        graphs = [(k, oriented_graph(k)) for k in range(6)]
+        arrays = RelationshipDatabase(settings, graphs).arrays()
+        assert as_rows(
+            RelationshipDatabase.from_arrays(settings, arrays).votes(graphs[2][1])
+        ) == as_rows(RelationshipDatabase(settings, graphs).votes(graphs[2][1]))
+        if name not in arrays:
+            continue
+        arrays[name] = changed(arrays[name])
+        with pytest.raises(ValueError, match=r"arrays|identifier"):
+            RelationshipDatabase.from_arrays(settings, arrays)
+
+
+def test_arrays_of_another_relation_are_refused():
+    arrays = RelationshipDatabase(by_length(), [(1, oriented_graph(3))]).arrays()
+    with pytest.raises(ValueError, match="missing"):
+        RelationshipDatabase.from_arrays(DatabaseSettings(), arrays)
+
+
+def test_what_is_removed_later_does_not_change_the_arrays_that_were_given():
+    searched = RelationshipDatabase(DatabaseSettings(), [(k, oriented_graph(k)) for k in range(9)])
+    arrays = searched.arrays()
+    before = {name: array.tobytes() for name, array in arrays.items()}
+    for k in range(9):
+        searched.remove(k)
+        searched.add(100 + k, oriented_graph(50 + k))
+    assert {name: array.tobytes() for name, array in arrays.items()} == before
 
 
 def test_an_identifier_is_taken_once():

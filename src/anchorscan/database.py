@@ -42,7 +42,7 @@ _SMALLEST_PART = 4096
 # A reference of fewer edges counts as one of so many oriented ones: few edges prove little.
 _FEWEST_EDGES = 16
 # Up to so many the best are picked in one pass; beyond, all are sorted.
-_FEW = 64
+_FEW = 256
 
 Number = TypeVar("Number", np.int32, np.int64)
 
@@ -302,19 +302,19 @@ def _with_room(values: NDArray[Number], slot: int) -> NDArray[Number]:
 @kernel
 def _best(counts, sizes, identifiers, edges, most):  # type: ignore[no-untyped-def]
     """The ``most`` slots of highest quality: identifiers, counts and qualities, in order."""
-    alive = 0
-    for slot in range(len(sizes)):
-        if sizes[slot] >= 0:
-            alive += 1
-    most = min(most, alive)
     quality = np.empty(most)
     chosen = np.empty(most, np.int64)
     found = 0
+    enough = 0.0
     for slot in range(len(sizes)):
         if sizes[slot] < 0 or most == 0:
             continue
+        count = np.float64(counts[slot])
         pairs = np.float64(edges[0]) * max(sizes[slot], edges[1])
-        q = np.float64(counts[slot]) ** 2 / pairs if pairs > 0.0 else 0.0
+        # Nearly all of a large set are passed over here, without a division.
+        if count * count < enough * pairs:
+            continue
+        q = count**2 / pairs if pairs > 0.0 else 0.0
         if found == most:
             worst = chosen[found - 1]
             if q < quality[found - 1] or (
@@ -333,4 +333,7 @@ def _best(counts, sizes, identifiers, edges, most):  # type: ignore[no-untyped-d
         quality[k] = q
         chosen[k] = slot
         found += 1
-    return identifiers[chosen], counts[chosen], quality
+        if found == most:
+            enough = quality[found - 1] * (1.0 - 1e-9)
+    chosen = chosen[:found]
+    return identifiers[chosen], counts[chosen], quality[:found]

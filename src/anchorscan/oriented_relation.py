@@ -65,18 +65,18 @@ class OrientedSettings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
-    cell: float = Field(0.15, ge=0.02, description="width of the cells of edge vectors, metres")
+    cell: float = Field(0.2, ge=0.02, description="width of the cells of edge vectors, metres")
     position_tolerance: float = Field(
-        0.12, gt=0.0, le=1.0, description="corresponding edge vectors, per axis, metres"
+        0.16, gt=0.0, le=1.0, description="corresponding edge vectors, per axis, metres"
     )
     direction_tolerance: float = Field(
         math.radians(13.5), ge=0.0, description="free space at an anchor to its sector, radians"
     )
-    shortest_edge: float = Field(0.5, ge=0.0, description="edges that are used, metres")
+    shortest_edge: float = Field(1.0, ge=0.0, description="edges that are used, metres")
     longest_edge: float = Field(25.0, gt=0.0, le=30.0, description="edges that are used, metres")
     most_edges: int = Field(256, ge=1, description="edges that are kept of one reference")
     most_votes: int = Field(
-        8_000_000, ge=1, description="database edges looked at; the commonest keys go first"
+        500_000, ge=1, description="database edges looked at; the commonest keys go first"
     )
 
 
