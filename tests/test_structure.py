@@ -22,7 +22,7 @@ ORDER = (
     *("errors", "pose", "scan", "record", "reference", "protocol", "journey", "array_file", "_jit"),
     *("angle_function", "segments", "anchors", "graph"),
     *("length_relation", "oriented_relation", "database", "alignment"),
-    *("field", "proposal", "verification", "evaluation", "hypothesis", "decision"),
+    *("evidence", "field", "proposal", "verification", "evaluation", "hypothesis", "decision"),
     *("motion", "belief", "settings"),
     *("description", "pairwise", "stitched_map", "matcher"),
     *("set_file", "set_directory", "reference_set", "localizer"),
