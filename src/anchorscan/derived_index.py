@@ -266,8 +266,8 @@ def _check_references(arrays: Mapping[str, NDArray[Any]], count: int) -> None:
     Raises:
         ValueError: One does.
     """
-    for name, kind in _TYPES.items():
-        if arrays[name].dtype != kind:
+    for name, array in arrays.items():
+        if array.dtype != _TYPES.get(name, array.dtype):
             raise ValueError(f"{name} of the index has values of another kind")
     sensors = arrays["scans.sensors"]
     lengths = (("scans.starts", "scans.ranges"), ("names.starts", "names.text"))

@@ -106,20 +106,15 @@ class TileEvidence:
             self._load(closed, keys, make)
         return np.array([self._open.get(key, 0) for key in keys], np.int32)
 
-    def packed(
-        self, squares: NDArray[np.int64]
-    ) -> tuple[NDArray[np.bool_], NDArray[np.uint8], NDArray[np.int64]]:
-        """Pack the evidence of tiles one behind the other.
+    def packed(self, squares: NDArray[np.int64]) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
+        """Pack the evidence of (N, 2) squares one behind the other.
 
         Returns:
-            (N,) whether there is any of each of ``squares``; (E,) uint8 of those that have
-            some, and where that of each of them begins.
+            (E,) uint8, and (N + 1,) where that of each begins.
         """
         all_of_them = [self._packed_one(key) for key in _keys(squares).tolist()]
-        kept = np.array([bool(len(each)) for each in all_of_them], np.bool_)
-        sizes = [len(each) for each in all_of_them if len(each)]
         packed = np.frombuffer(b"".join(all_of_them), np.uint8)
-        return kept, packed, np.cumsum([0, *sizes], dtype=np.int64)
+        return packed, np.cumsum([0, *map(len, all_of_them)], dtype=np.int64)
 
     def _load(self, closed: Sequence[int], wanted: Sequence[int], make: bool) -> None:
         """Open tiles that are not, where there are such or they are to be made."""

@@ -240,12 +240,15 @@ class LikelihoodField:
         numbers = np.concatenate([np.empty(0, np.int32), *tiles])
         order = np.lexsort((squares[:, 1], squares[:, 0]))
         squares, numbers = squares[order], numbers[order]
-        kept, evidence, starts = self._evidence.packed(squares)
-        numbers = np.concatenate([[0], numbers[kept]]).astype(np.int64)
+        # What was removed leaves tiles that tell nothing.
+        evidence, starts = self._evidence.packed(squares)
+        told = np.array([np.any(self._codes[number] != _FAR) for number in numbers], np.bool_)
+        told |= np.diff(starts) > 0
+        numbers = np.concatenate([[0], numbers[told]]).astype(np.int64)
         return FieldArrays(
-            squares[kept].astype(np.int32),
+            squares[told].astype(np.int32),
             evidence,
-            starts,
+            np.append(starts[:-1][told], starts[-1]),
             self._coarse[numbers],
             self._codes[numbers],
         )
@@ -405,9 +408,9 @@ class LikelihoodField:
             numbers = np.zeros(self._used, np.int32)
             numbers[kept] = np.arange(len(kept), dtype=np.int32)
             self._table, self._table_published = numbers[self._table], 1
-        room = max(len(kept) + count, len(kept) + len(kept) // 2)
-        self._codes = _grown(self._codes[kept], room, _FAR)
-        self._coarse = _grown(self._coarse[kept], room, int(self._coarse[0, 0]))
+        room = len(kept) + count + max(len(kept) // 2, _GROUP // 2)
+        self._codes = _grown(self._codes[kept], room)
+        self._coarse = _grown(self._coarse[kept], room)
         # Nobody reads these copies yet.
         self._used, self._published = len(kept), 1
 
@@ -432,7 +435,7 @@ class LikelihoodField:
         if self._table_used + len(i) > len(self._table):
             used, directory = np.unique(np.append(directory, 0), return_inverse=True)
             directory = directory[:-1].reshape(self._pages.shape).astype(np.int32)
-            self._table = _grown(self._table[used], 2 * (len(used) + len(i)), 0)
+            self._table = _grown(self._table[used], 2 * (len(used) + len(i)))
             self._table_used, self._table_published = len(used), 1
         stale = directory[i, j] < self._table_published
         i, j = i[stale], j[stale]
@@ -444,8 +447,9 @@ class LikelihoodField:
         self._table[directory[pages[:, 0], pages[:, 1]], at] = tiles
 
 
-def _grown(layer: NDArray, room: int, fill: int) -> NDArray:  # type: ignore[type-arg]
-    grown = np.full((room, *layer.shape[1:]), fill, layer.dtype)
+def _grown(layer: NDArray, room: int) -> NDArray:  # type: ignore[type-arg]
+    """Copy into a longer array; what is new holds anything."""
+    grown = np.empty((room, *layer.shape[1:]), layer.dtype)
     grown[: len(layer)] = layer
     return grown
 

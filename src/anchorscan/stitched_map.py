@@ -138,16 +138,19 @@ class StitchedMap:
         """
         places = cls.__new__(cls)
         places._begin(settings, read)
-        lot = _lot_from(arrays, settings)
+        try:
+            lot = _lot_from(arrays, settings)
+        except (KeyError, TypeError) as error:
+            raise ValueError(f"arrays of the map are missing: {error}") from None
         places._next_serial = len(lot)
         places._database = RelationshipDatabase.from_arrays(
             settings.database, _section(arrays, "database.")
         )
+        # Removed references leave their slots, so these may be in another order.
         if not np.array_equal(np.sort(arrays["database.identifiers"]), lot.identifiers):
             raise ValueError("the relationship database is of other references")
-        places._field = LikelihoodField.from_arrays(
-            settings.field, FieldArrays(**_section(arrays, "field."))
-        )
+        field = FieldArrays._make(arrays[f"field.{name}"] for name in FieldArrays._fields)
+        places._field = LikelihoodField.from_arrays(settings.field, field)
         places._hold((lot,))
         return places
 
@@ -187,11 +190,17 @@ class StitchedMap:
                 "references.identifiers": lot.identifiers,
                 "references.poses": lot.poses,
                 **{f"anchors.{name}": array for name, array in vars(lot.anchors).items()},
-                **{f"landmarks.{name}": each for name, each in lot.landmarks._asdict().items()},
+                **self._stored_landmarks(lot),
                 **{f"field.{name}": each for name, each in self._field.arrays()._asdict().items()},
             }
         database = self._voting().arrays()
         return found | {f"database.{name}": array for name, array in database.items()}
+
+    def _stored_landmarks(self, lot: Lot) -> dict[str, NDArray[Any]]:
+        """Landmarks of all references, unless only those that are voted for propose."""
+        if self._settings.database.candidates is not None:
+            return {}
+        return {f"landmarks.{name}": each for name, each in lot.landmarks._asdict().items()}
 
     def add(self, known: Known) -> None:
         """Add a reference that has a pose.
@@ -383,12 +392,8 @@ def _section(arrays: Mapping[str, NDArray[Any]], prefix: str) -> dict[str, NDArr
 
 def _lot_from(arrays: Mapping[str, NDArray[Any]], settings: Settings) -> Lot:
     """Make a lot of stored arrays, whose landmarks are there already."""
-    try:
-        anchors = AnchorStack(**_section(arrays, "anchors."))
-        stored = Landmarks(**_section(arrays, "landmarks."))
-        identifiers, poses = arrays["references.identifiers"], arrays["references.poses"]
-    except (KeyError, TypeError) as error:
-        raise ValueError(f"arrays of the map are missing: {error}") from None
+    anchors = AnchorStack(**_section(arrays, "anchors."))
+    identifiers, poses = arrays["references.identifiers"], arrays["references.poses"]
     count = len(identifiers)
     lot = Lot(
         identifiers,
@@ -400,8 +405,11 @@ def _lot_from(arrays: Mapping[str, NDArray[Any]], settings: Settings) -> Lot:
         settings.proposal,
     )
     lot.check()
-    check_landmarks(stored)
-    lot.__dict__["landmarks"] = stored
+    landmarks = _section(arrays, "landmarks.")
+    if landmarks:
+        stored = Landmarks(**landmarks)
+        check_landmarks(stored)
+        lot.__dict__["landmarks"] = stored
     return lot
 
 
