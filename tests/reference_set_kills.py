@@ -31,6 +31,8 @@ from anchorscan.reference_set import ReferenceSet
 
 BATCH = 7
 WAYS = ("add", "build", "save")
+# Takes a second to start: the numbers of anchors are derived.
+INDEXED = "index"
 BUILT = 1500
 LONGEST_WAIT = 0.12
 
@@ -61,6 +63,8 @@ def write(way: str, path: Path) -> None:
         say("done")
     while way == "add":
         add_and_remove(path)
+    while way == INDEXED:
+        add_and_index(path)
     while way == "save":
         for generation in range(1, 1_000_000):
             places = ReferenceSet(name=str(generation))
@@ -84,6 +88,17 @@ def add_and_remove(path: Path) -> None:
             say(f"{added[-1] + 1} {len(places)}")
             places.remove(added[0])
             say(f"{added[-1] + 1} {len(places)}")
+
+
+def add_and_index(path: Path) -> None:
+    """Open, add a batch, and write the index anew, several times."""
+    with ReferenceSet.open(path) if path.exists() else ReferenceSet(path=path) as places:
+        for _ in range(3):
+            first = places.info().next_identifier
+            numbers = range(first, first + BATCH)
+            added = places.add_batch([scan_of(n) for n in numbers], [pose_of(n) for n in numbers])
+            say(f"{added[-1] + 1} {len(places)}")
+            places.save_index()
 
 
 def say(line: str) -> None:
@@ -183,7 +198,27 @@ def check_saved(path: Path, said: list[str], _: int) -> int:
     return 0
 
 
-CHECKS = {"add": check_added, "build": check_built, "save": check_saved}
+def check_indexed(path: Path, said: list[str], before: int) -> int:
+    """Whatever index is there, the set with it is the set without it, and so are answers."""
+    places, plain = ReferenceSet.open(path), ReferenceSet.open(path, use_index=False)
+    check_bits(places)
+    assert (
+        len(places) == len(plain) >= max([before, *(int(line.split()[1]) - BATCH for line in said)])
+    )
+    assert [r.identifier for r in places.references] == [r.identifier for r in plain.references]
+    for number in (0, len(plain) - 1):
+        ours, theirs = (each.locate(scan_of(number), 3)[0] for each in (places, plain))
+        assert ours.pose == theirs.pose
+        assert ours.probability == theirs.probability
+    return len(places)
+
+
+CHECKS = {
+    "add": check_added,
+    "build": check_built,
+    "save": check_saved,
+    INDEXED: check_indexed,
+}
 
 
 def kill_many(way: str, kills: int, seed: int, folder: Path) -> int:
@@ -216,7 +251,7 @@ def main() -> None:
         return
     folder = Path(tempfile.mkdtemp())
     try:
-        for way in WAYS:
+        for way in (*WAYS, INDEXED):
             left = kill_many(way, arguments.kills, arguments.seed, folder)
             print(f"{way}: {arguments.kills} kills, {left} files checked, nothing lost")
     except (AssertionError, ReferenceSetError):

@@ -251,8 +251,7 @@ def among(poses, others):
 def same_proposals(kernel, twin, anchors, known, limits):
     """What the twin proposes with a little less slack is proposed, and nothing with more."""
     out = np.empty((4096, 3))
-    arguments = query_of(anchors), known, numbers_of(limits), out
-    found = kernel(*arguments, 0) if kernel is lone_proposals else kernel(*arguments)
+    found = kernel(query_of(anchors), known, numbers_of(limits), out, 0)
     ours = out[:found] * (1.0, 1.0, UNIT)
     sure = twin(anchors, known, limits, -1e-3)
     possible = twin(anchors, known, limits, 1e-3)

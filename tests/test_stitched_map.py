@@ -26,8 +26,8 @@ from anchorscan import (
 )
 from anchorscan.description import describe
 from anchorscan.pairwise import Known
+from anchorscan.placed import lot_of, nearest
 from anchorscan.stitched_map import StitchedMap
-from anchorscan.stitched_map import _stand_for as stand_for
 
 DEFAULT = Settings.preset("default")
 numbers = st.integers(0, BUILDINGS - 1)
@@ -353,16 +353,40 @@ def plain_stand_for(references, poses):
     return rows
 
 
-@given(seeds, st.integers(1, 12), st.integers(0, 4))
-def test_the_nearest_reference_stands_for_a_pose(seed, references, poses):
+NOTHING_SEEN = LaserScan(np.full(3, np.inf), 0.0, 0.1)
+
+
+@given(seeds, st.integers(1, 40), st.integers(0, 4), st.sampled_from([4.0, 60.0, 2000.0]))
+def test_the_nearest_reference_stands_for_a_pose(seed, references, poses, wide):
     rng = np.random.default_rng(seed)
-    known = rng.normal(0.0, (4.0, 4.0, 3.0), (references, 3))
-    asked = rng.normal(0.0, (4.0, 4.0, 3.0), (poses, 3))
-    nearest, relative = stand_for(known, asked)
-    for k, row, (best, expected) in zip(
-        nearest.tolist(), relative, plain_stand_for(known, asked), strict=True
+    known = rng.normal(0.0, (wide, wide, 3.0), (references, 3))
+    asked = rng.normal(0.0, (wide, wide, 3.0), (poses, 3))
+    described = describe(NOTHING_SEEN, DEFAULT)
+    lots = [
+        lot_of(
+            [
+                Known(Reference(k, NOTHING_SEEN, Pose2D(*known[k])), described)
+                for k in some.tolist()
+            ],
+            0,
+            DEFAULT.proposal,
+        )
+        for some in np.array_split(np.arange(references), 3)
+    ]
+    gone = set(rng.choice(references, references // 4, replace=False).tolist())
+    for lot in lots:
+        lot.is_there[:] = [k not in gone for k in lot.identifiers.tolist()]
+    known[sorted(gone)] = math.nan
+    left = np.flatnonzero(~np.isnan(known[:, 0]))
+    numbers, places, relative = nearest(lots, asked)
+    for n, k, row, (best, expected) in zip(
+        numbers.tolist(),
+        places.tolist(),
+        relative,
+        plain_stand_for(known[left], asked),
+        strict=True,
     ):
-        assert k == best
+        assert lots[n].identifiers[k] == left[best]
         assert Pose2D(*row).distance(expected) < 1e-9
         assert Pose2D(*row).turn(expected) < 1e-9
 

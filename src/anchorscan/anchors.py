@@ -28,6 +28,7 @@ the walls of the other direction from filling it evenly.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 
@@ -53,10 +54,12 @@ __all__ = [
     "AnchorKind",
     "AnchorPoints",
     "AnchorSettings",
+    "AnchorStack",
     "VirtualEdges",
     "anchor_points",
     "angle_anchors",
     "jump_edge_anchors",
+    "stack_anchors",
     "virtual_edges",
 ]
 
@@ -123,6 +126,69 @@ class AnchorPoints:
 
     def __len__(self) -> int:
         return len(self.kinds)
+
+
+@dataclass(frozen=True, eq=False)
+class AnchorStack:
+    """The anchor points of several scans one behind the other.
+
+    Args:
+        positions: (A, 2) metres, each in the frame of its own scan.
+        kinds: (A,) as in ``AnchorPoints``.
+        directions: (A,) radians.
+        main_angles: (C,) of each scan.
+        starts: (C + 1,) where the anchor points of each scan begin.
+    """
+
+    positions: NDArray[np.float64]
+    kinds: NDArray[np.int64]
+    directions: NDArray[np.float64]
+    main_angles: NDArray[np.float64]
+    starts: NDArray[np.int64]
+
+    def __len__(self) -> int:
+        return len(self.main_angles)
+
+    def of(self, scan: int) -> AnchorPoints:
+        """Return the anchor points of one scan."""
+        own = slice(self.starts[scan], self.starts[scan + 1])
+        return AnchorPoints(
+            self.positions[own],
+            self.kinds[own],
+            self.directions[own],
+            float(self.main_angles[scan]),
+        )
+
+    def of_some(self, scans: NDArray[np.int64]) -> AnchorStack:
+        """Return the anchor points of some scans, in the order of their numbers given."""
+        sizes = np.diff(self.starts)[scans]
+        starts = np.zeros(len(scans) + 1, np.int64)
+        np.cumsum(sizes, out=starts[1:])
+        at = np.arange(starts[-1]) + np.repeat(self.starts[scans] - starts[:-1], sizes)
+        return AnchorStack(
+            self.positions[at], self.kinds[at], self.directions[at], self.main_angles[scans], starts
+        )
+
+    def followed_by(self, others: AnchorStack) -> AnchorStack:
+        """Put the anchor points of others behind these."""
+        return AnchorStack(
+            np.concatenate([self.positions, others.positions]),
+            np.concatenate([self.kinds, others.kinds]),
+            np.concatenate([self.directions, others.directions]),
+            np.concatenate([self.main_angles, others.main_angles]),
+            np.concatenate([self.starts, self.starts[-1] + others.starts[1:]]),
+        )
+
+
+def stack_anchors(scans: Sequence[AnchorPoints]) -> AnchorStack:
+    """Put the anchor points of scans one behind the other; none at all gives an empty stack."""
+    return AnchorStack(
+        np.concatenate([np.empty((0, 2)), *(each.positions for each in scans)]),
+        np.concatenate([np.empty(0, np.int64), *(each.kinds for each in scans)]),
+        np.concatenate([np.empty(0), *(each.directions for each in scans)]),
+        np.array([each.main_angle for each in scans], np.float64),
+        np.cumsum([0, *(len(each) for each in scans)], dtype=np.int64),
+    )
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,16 +4,24 @@ A short line of JSON says what the file was made of and where every array lies, 
 and what its checksum is; the arrays follow, each at a multiple of 64 bytes, little endian.
 Nothing in the file is code and nothing is pickled.  A file is written beside its place and
 renamed, so that readers see the old one or the new one, and keep the one that they have opened.
+
+What is mapped may be written to: changes are this process's own and never reach the file.  An
+array may have *room* behind it, a hole in the file that takes no place on the disk until then.
 """
 
 from __future__ import annotations
 
+import glob
 import json
 import math
 import mmap
 import os
+import secrets
+import time
 import zlib
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -26,37 +34,59 @@ _MAGIC = b"anchorscan arrays 1\n"
 _ALIGNED = 64
 # The head is read whole: longer ones are damage.
 _LONGEST_HEAD = 1 << 20
+# Checksums are of pieces of so many bytes, so that several threads can share an array.
+_PIECE = 1 << 24
+_THREADS = 4
+# A draft that nobody has written to for so many seconds was left by a process that was killed.
+_FORSAKEN = 3600.0
 
 
-def write_arrays(path: Path, arrays: Mapping[str, NDArray[Any]], made_of: str) -> None:
+def write_arrays(
+    path: Path,
+    arrays: Mapping[str, NDArray[Any]],
+    made_of: str,
+    room: Mapping[str, int] | None = None,
+) -> None:
     """Write arrays into one file, or leave what was there.
+
+    A process killed meanwhile leaves a hidden draft beside it, ``.NAME.*.part``; a later one
+    removes that.
 
     Args:
         path: The file; it is replaced as a whole.
         arrays: By name.
         made_of: What they were derived from (a digest, say): the key to read them with.
+        room: Rows by which an array is longer when it is read; what they hold is no matter.
 
     Raises:
         OSError: The file cannot be written.
     """
     kept = {name: _little(array) for name, array in arrays.items()}
-    head = _head(kept, made_of)
-    draft = path.with_name(f".{path.name}.{os.getpid()}.part")
+    head, offsets, end = _head(kept, made_of, room or {})
+    _remove_forsaken(path)
+    draft = path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
     try:
-        with draft.open("wb") as stream:
+        with draft.open("xb") as stream:
             stream.write(_MAGIC + head)
-            for array in kept.values():
-                stream.write(b"\0" * (_aligned(stream.tell()) - stream.tell()))
+            for name, array in kept.items():
+                stream.seek(offsets[name])
                 stream.write(_bytes(array))
+            stream.truncate(end)
             stream.flush()
             os.fsync(stream.fileno())
         draft.replace(path)
+        with suppress(OSError):  # not every system lets a folder be synchronised
+            folder = os.open(path.parent, os.O_RDONLY)
+            try:
+                os.fsync(folder)
+            finally:
+                os.close(folder)
     finally:
         draft.unlink(missing_ok=True)
 
 
 def read_arrays(path: Path, made_of: str, *, verify: bool = True) -> dict[str, NDArray[Any]] | None:
-    """Map the arrays of a file, read-only.
+    """Map the arrays of a file; what is written to them stays in this process.
 
     Args:
         path: The file.
@@ -73,16 +103,19 @@ def read_arrays(path: Path, made_of: str, *, verify: bool = True) -> dict[str, N
                 return None
             line = stream.readline(_LONGEST_HEAD)
             size = os.fstat(stream.fileno()).st_size
-            whole = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
+            whole = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_COPY)
     except (OSError, ValueError):
         return None
     try:
         head = json.loads(line)
         if head["made_of"] != made_of or head["bytes"] != size:
             return None
-        return {name: _mapped(whole, entry, verify) for name, entry in head["arrays"].items()}
-    except (ValueError, KeyError, TypeError, AttributeError):
+        mapped = {name: _mapped(whole, entry) for name, entry in head["arrays"].items()}
+        if verify:
+            _verify({name: (mapped[name], entry) for name, entry in head["arrays"].items()})
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError, OverflowError):
         return None
+    return mapped
 
 
 def _little(array: NDArray[Any]) -> NDArray[Any]:
@@ -101,14 +134,19 @@ def _aligned(offset: int) -> int:
     return -(-offset // _ALIGNED) * _ALIGNED
 
 
-def _head(arrays: Mapping[str, NDArray[Any]], made_of: str) -> bytes:
-    """Return the line that says what lies where, and how long the file is."""
-    entries = {
+def _head(
+    arrays: Mapping[str, NDArray[Any]], made_of: str, room: Mapping[str, int]
+) -> tuple[bytes, dict[str, int], int]:
+    """Return the line that says what lies where, the offsets in it, and the length of the file."""
+    with ThreadPoolExecutor(_THREADS) as threads:
+        checksums = {name: list(threads.map(zlib.crc32, _pieces(a))) for name, a in arrays.items()}
+    entries: dict[str, dict[str, Any]] = {
         name: {
             "dtype": array.dtype.str,
-            "shape": list(array.shape),
+            "shape": [len(array) + room.get(name, 0), *array.shape[1:]],
+            "rows": len(array),
             "offset": 0,
-            "crc32": zlib.crc32(_bytes(array)),
+            "crc32": checksums[name],
         }
         for name, array in arrays.items()
     }
@@ -116,26 +154,53 @@ def _head(arrays: Mapping[str, NDArray[Any]], made_of: str) -> bytes:
     # Room for the numbers that follow from the length of the line itself.
     length = len(json.dumps(head)) + 24 * (len(entries) + 1)
     end = len(_MAGIC) + length
-    for name, array in arrays.items():
-        entries[name]["offset"] = _aligned(end)
-        end = _aligned(end) + array.nbytes
+    for entry in entries.values():
+        entry["offset"] = _aligned(end)
+        end = _aligned(end) + math.prod(entry["shape"]) * np.dtype(entry["dtype"]).itemsize
     head["bytes"] = end
-    return json.dumps(head).encode().ljust(length - 1) + b"\n"
+    offsets = {name: entry["offset"] for name, entry in entries.items()}
+    return json.dumps(head).encode().ljust(length - 1) + b"\n", offsets, end
 
 
-def _mapped(whole: mmap.mmap, entry: Mapping[str, Any], verify: bool) -> NDArray[Any]:
+def _mapped(whole: mmap.mmap, entry: Mapping[str, Any]) -> NDArray[Any]:
     """One array of a file.
 
     Raises:
-        ValueError: It does not lie within the file, or its checksum is another.
+        ValueError: It does not lie within the file.
     """
     dtype, shape, offset = np.dtype(entry["dtype"]), tuple(entry["shape"]), int(entry["offset"])
-    if dtype.hasobject or any(int(size) < 0 for size in shape):
+    if dtype.hasobject or not dtype.itemsize or any(int(size) < 0 for size in shape):
         raise ValueError("no array of numbers")
     count = math.prod(shape)
-    if offset < 0 or offset + count * dtype.itemsize > len(whole):
+    if offset < 0 or offset % _ALIGNED or offset + count * dtype.itemsize > len(whole):
         raise ValueError("an array beyond the end of the file")
+    if not 0 <= int(entry["rows"]) <= shape[0]:
+        raise ValueError("an array with more rows than it has")
     array = np.frombuffer(whole, dtype, count, offset) if count else np.empty(0, dtype)
-    if verify and zlib.crc32(_bytes(array)) != entry["crc32"]:
-        raise ValueError("an array is damaged")
     return array.reshape(shape)
+
+
+def _verify(arrays: Mapping[str, tuple[NDArray[Any], Mapping[str, Any]]]) -> None:
+    """Compare all checksums.
+
+    Raises:
+        ValueError: One is another.
+    """
+    with ThreadPoolExecutor(_THREADS) as threads:
+        for array, entry in arrays.values():
+            if list(threads.map(zlib.crc32, _pieces(array[: entry["rows"]]))) != entry["crc32"]:
+                raise ValueError("an array is damaged")
+
+
+def _pieces(array: NDArray[Any]) -> list[memoryview]:
+    """The bytes of an array in pieces, not copied."""
+    whole = _bytes(array)
+    return [whole[first : first + _PIECE] for first in range(0, len(whole), _PIECE)]
+
+
+def _remove_forsaken(path: Path) -> None:
+    """Remove drafts that killed processes have left."""
+    for draft in path.parent.glob(f".{glob.escape(path.name)}.*.part"):
+        with suppress(OSError):
+            if time.time() - draft.stat().st_mtime > _FORSAKEN:
+                draft.unlink()

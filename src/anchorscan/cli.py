@@ -44,6 +44,8 @@ __all__ = ["app", "main"]
 
 _FAILED = 1
 _MAP_SUFFIXES = (".yaml", ".yml")
+# Sets of fewer references open in a moment without an index.
+_WORTH_AN_INDEX = 1000
 _PROGRESS_DELAY = 1.0
 _PROGRESS_INTERVAL = 0.1
 # How many malformed lines a message names before it says "and so on".
@@ -254,6 +256,13 @@ def build(
     upside_down: UpsideDownOption = False,
     preset: PresetOption = None,
     settings_file: SettingsOption = None,
+    index: Annotated[
+        bool | None,
+        typer.Option(
+            help="Write what is derived from the scans to SET.index, so that a large set opens at "
+            "once. Without either, from 1000 references on."
+        ),
+    ] = None,
 ) -> None:
     """Make a reference set from the scans of logs with poses.
 
@@ -289,7 +298,12 @@ def build(
         path=output,
     ) as places:
         info = places.info()
-    _say(f"{output}: {info.references} references{_source(info)}")
+        _say(f"{output}: {info.references} references{_source(info)}")
+        is_map_of_all = info.with_pose == info.references and places.settings.method == "map"
+        if index or (index is None and is_map_of_all and info.references >= _WORTH_AN_INDEX):
+            places.save_index()
+            size = places.info().index_size or 0
+            _say(f"{output}.index: {size:,} bytes, derived from it")
 
 
 @app.command()
@@ -636,7 +650,7 @@ def info(
     """Say what a reference set holds."""
     from .reference_set import ReferenceSet
 
-    with ReferenceSet.open(set_file) as places:
+    with ReferenceSet.open(set_file, use_index=False) as places:  # which verifies every reference
         facts = _facts(places.info())
     if as_json:
         typer.echo(json.dumps(facts))
@@ -644,6 +658,22 @@ def info(
     for name, value in facts.items():
         if value is not None:
             typer.echo(f"{name.replace('_', ' ') + ':':<13}{_in_words(name, value)}")
+
+
+@app.command()
+@_guarded
+def index(set_file: SetArgument) -> None:
+    """Write what is derived from a set to SET.index, so that it opens at once.
+
+    The index may be deleted at any time. What is added to the set later does not need it to be
+    written anew, as long as that is little.
+    """
+    from .reference_set import ReferenceSet
+
+    with ReferenceSet.open(set_file) as places:
+        places.save_index()
+        info = places.info()
+    _say(f"{set_file}.index: {info.index_size or 0:,} bytes of {info.references} references")
 
 
 @app.command()
@@ -1544,6 +1574,14 @@ def _source(info: SetInfo) -> str:
     return ", ".join(parts)
 
 
+_INDEX_STATES = {
+    "current": "current",
+    "behind": "behind by a few references, which are derived on opening",
+    "outdated": "outdated or damaged, not used; anchorscan index writes it anew",
+    "unknown": "not looked at, since the settings of the set are not understood",
+}
+
+
 def _facts(info: SetInfo) -> dict[str, Any]:
     build = info.build
     return {
@@ -1576,6 +1614,7 @@ def _facts(info: SetInfo) -> dict[str, Any]:
             "without_pose": build.without_pose,
             "finished": build.finished,
         },
+        "index": None if info.index == "none" else {"state": info.index, "bytes": info.index_size},
     }
 
 
@@ -1596,6 +1635,8 @@ def _in_words(name: str, value: Any) -> str:
         rule = f"one per {value['spacing']:g} m and {math.degrees(value['heading']):g} degrees"
         state = "" if value["finished"] else "; not finished, build it again to go on"
         return f"{'every scan' if value['keep_all'] else rule}, of {value['scans']} scans{state}"
+    if name == "index":
+        return f"{_INDEX_STATES[value['state']]}, {value['bytes']:,} bytes"
     return str(value)
 
 

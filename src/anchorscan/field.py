@@ -8,9 +8,9 @@ speaks for a pose, one that ends in known free space against it, one that ends w
 looked says nothing; a ray that passes through a known surface speaks against it, too.
 
 The map is kept in tiles of 64 x 64 cells, which exist only where a ray told something: on its
-way, and within ``reach`` of its end.  A tile holds the evidence as integers (hits, their mean
-position, passes), so that adding and removing a reference are exact opposites and the order of
-references is irrelevant, and one byte a cell derived from it:
+way, and within ``reach`` of its end.  A tile has evidence in integers (``evidence``), so that
+adding and removing a reference are exact opposites and the order of references is irrelevant,
+and one byte a cell derived from it:
 
     bits 0-5   distance to the nearest surface in 63rds of ``reach``; 63 is farther
     bit 6      rays passed here: known free space
@@ -18,13 +18,16 @@ references is irrelevant, and one byte a cell derived from it:
 
 A coarse copy (cells four times as wide) holds the best score of its cells, so that a pose
 that is a few decimetres off can be told from a wrong one with a handful of look-ups.
+
+Tiles are found through a table of squares, in pages of 64 x 64 squares.  Whoever reads keeps the
+map that was there when reading began: a change writes new versions of the tiles and pages that
+it touches, and no others, so that its price does not grow with the map.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -33,24 +36,36 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from ._jit import kernel
 from .errors import AnchorscanError
+from .evidence import SIDE as _SIDE
+from .evidence import TileEvidence
 from .pose import Pose2D
 from .scan import LaserScan
 
-__all__ = ["FieldSettings", "LikelihoodField", "Tiles"]
+__all__ = ["FieldArrays", "FieldSettings", "LikelihoodField", "Tiles"]
 
-_SIDE = 64  # cells of a tile
+_BLOCK = 8  # cells of the blocks of a tile that are derived anew
+_BLOCKS = _SIDE // _BLOCK
+_ALL_BLOCKS = (1 << _BLOCKS * _BLOCKS) - 1
 _COARSE = 4  # cells of a coarse cell
 _FAR = 63  # distance code of "farther than reach"
 _FREE, _SURFACE = 64, 128
 # Farther than this from all surfaces, metres, a ray is clear of them.
 _CLEAR = 0.2
+_PAGE = 64  # squares along a side of a page of the table
+# So many pages cover fifty kilometres times fifty with cells of 5 cm.
+_MOST_PAGES = 1 << 16
+# Tiles whose evidence is worked on at once, and rays that are deposited at once.
+_GROUP = 1024
+_MANY_RAYS = 1 << 14
+# Scans that lie so many squares apart are not deposited at once.
+_WIDEST = 256
+_CENTRES = np.arange(_BLOCK, dtype=np.float32) + np.float32(0.5)
 # A ray is followed no farther, metres: a reading may claim any length.
 _LONGEST_RAY = 100.0
-# A table of so many squares, a quarter of a gigabyte, is for a city.
-_MOST_SQUARES = 1 << 26
 # Hit positions are summed in 256ths of a cell, so that sums stay integers.
 _FRACTIONS = 256
-_1, _4, _6, _8, _12, _15, _63, _64 = (np.uint64(value) for value in (1, 4, 6, 8, 12, 15, 63, 64))
+_1, _4, _6, _8, _12 = (np.uint64(value) for value in (1, 4, 6, 8, 12))
+_15, _63, _64 = (np.uint64(value) for value in (15, 63, 64))
 
 
 class FieldSettings(BaseModel):
@@ -89,18 +104,21 @@ class Tiles(NamedTuple):
     """What kernels read of the map.
 
     Args:
-        table: (height * width,) int32, which tile covers each square of the frame; 0 is the
-            empty one, and the border squares have no other.
+        pages: (height * width,) int32, which page of the table covers each block of 64 x 64
+            squares; page 0 has no tiles.
+        table: (P * 4096,) int32, which tile covers each square; 0 is the empty one, and the
+            squares along the border have no other.
         codes: (T * 4096,) uint8, a byte a cell; tile 0 is all unknown.
         coarse: (T * 256,) int8, best score in each coarse cell, 127ths.
-        width: Squares in a row of the table.
-        height: Rows of the table.
-        column: Cell column of the table's left border in the set's frame.
-        row: Cell row of its lower border.
+        width: Pages in a row.
+        height: Rows of pages.
+        column: Cell column of the left border in the set's frame.
+        row: Cell row of the lower border.
         resolution: Width of a cell, metres.
         reach: Distance that the codes tell, metres.
     """
 
+    pages: NDArray[np.int32]
     table: NDArray[np.int32]
     codes: NDArray[np.uint8]
     coarse: NDArray[np.int8]
@@ -112,17 +130,25 @@ class Tiles(NamedTuple):
     reach: float
 
 
-class _Evidence(NamedTuple):
-    """Per tile and cell, what the rays found; integers, so that it can be taken back."""
+class FieldArrays(NamedTuple):
+    """A map as plain arrays, to be stored.
 
-    hits: NDArray[np.int32]
-    x: NDArray[np.int32]
-    y: NDArray[np.int32]
-    passes: NDArray[np.int32]
+    Args:
+        squares: (T, 2) int32 row and column of every tile, in this order.
+        evidence: (E,) uint8, their packed evidence, one behind the other.
+        evidence_starts: (T + 1,) int64, where that of each begins.
+        coarse: (T + 1, 256) int8 as in ``Tiles``, in the order of the squares after the empty one.
+        codes: (T + 1, 4096) uint8 likewise; may have room for more.
+    """
+
+    squares: NDArray[np.int32]
+    evidence: NDArray[np.uint8]
+    evidence_starts: NDArray[np.int64]
+    coarse: NDArray[np.int8]
+    codes: NDArray[np.uint8]
 
 
-@dataclass(frozen=True, eq=False)
-class _Rays:
+class _Rays(NamedTuple):
     """(N, 2) sensor positions and end points in the set's frame, metres."""
 
     origins: NDArray[np.float64]
@@ -140,115 +166,216 @@ class LikelihoodField:
     def __init__(
         self, settings: FieldSettings, scans: Iterable[tuple[LaserScan, Pose2D]] = ()
     ) -> None:
+        unknown = np.full((1, _SIDE * _SIDE), _FAR, np.uint8)
+        coarse = np.zeros((1, (_SIDE // _COARSE) ** 2), np.int8)
+        everything = np.full((1, 2), _ALL_BLOCKS, np.uint64)
+        _pool(np.zeros(1, np.int32), everything, unknown, coarse, settings.weights())
+        self._begin(settings, TileEvidence(), unknown, coarse, 1)
+        stale: set[tuple[int, int]] = set()
+        for rays in self._batches(scans):
+            touched, _ = self._deposit(rays, 1)
+            stale.update(map(tuple, touched.tolist()))
+        self._derive_all(np.array(sorted(stale), np.int64).reshape(-1, 2))
+        self._publish()
+
+    @classmethod
+    def from_arrays(cls, settings: FieldSettings, arrays: FieldArrays) -> LikelihoodField:
+        """Take up a map as it was stored; its arrays are used, not copied.
+
+        Raises:
+            ValueError: The arrays do not fit each other.
+        """
+        squares, codes, coarse = arrays.squares, arrays.codes, arrays.coarse
+        count = len(squares)
+        if (
+            squares.shape != (count, 2)
+            or codes.ndim != 2
+            or codes.shape[1] != _SIDE * _SIDE
+            or coarse.shape != (len(codes), (_SIDE // _COARSE) ** 2)
+            or len(codes) <= count
+        ):
+            raise ValueError("the tiles of the map have other sizes")
+        field = cls.__new__(cls)
+        evidence = TileEvidence(squares, arrays.evidence, arrays.evidence_starts)
+        field._begin(settings, evidence, codes, coarse, count + 1)
+        if count:
+            field._cover(squares.min(axis=0) - 1, squares.max(axis=0) + 2)
+            field._point(squares.astype(np.int64), np.arange(1, count + 1, dtype=np.int32))
+        field._live = count
+        field._publish()
+        return field
+
+    def _begin(
+        self,
+        settings: FieldSettings,
+        evidence: TileEvidence,
+        codes: NDArray[np.uint8],
+        coarse: NDArray[np.int8],
+        used: int,
+    ) -> None:
         self._settings = settings
-        self._table = np.zeros((1, 1), np.int32)
-        self._corner = (0, 0)
-        self._evidence = _no_evidence(1)
-        self._codes = np.full((1, _SIDE, _SIDE), _FAR, np.uint8)
-        self._coarse = np.zeros((1, _SIDE // _COARSE, _SIDE // _COARSE), np.int8)
-        _pool(np.zeros(1, np.int32), self._codes, self._coarse, settings.weights())
-        self._used = 1
-        self._tiles = self._snapshot()
-        self._change(self._rays(scans), 1)
+        self._weights = settings.weights()
+        self._evidence = evidence
+        self._pages = np.zeros((1, 1), np.int32)
+        self._corner = (0, 0)  # of the pages, counted in pages
+        self._is_placed = False
+        self._table = np.zeros((1, _PAGE * _PAGE), np.int32)
+        self._table_used = self._table_published = 1
+        self._codes, self._coarse = codes, coarse
+        self._used = self._published = used
+        self._live = 0
+        self._publish()
 
     @property
     def tiles(self) -> Tiles:
         """The map as kernels read it; it stays as it is when others add and remove."""
         return self._tiles
 
-    def _snapshot(self) -> Tiles:
-        row, column = self._corner
-        return Tiles(
-            self._table.reshape(-1),
-            self._codes.reshape(-1),
-            self._coarse.reshape(-1),
-            self._table.shape[1],
-            self._table.shape[0],
-            column * _SIDE,
-            row * _SIDE,
-            self._settings.resolution,
-            self._settings.reach,
+    def arrays(self) -> FieldArrays:
+        """Return the map as plain arrays, all that ``from_arrays`` needs."""
+        pages = np.argwhere(self._pages)
+        rows, columns, tiles = [], [], []
+        for i, j in pages.tolist():
+            page = self._table[self._pages[i, j]]
+            at = np.flatnonzero(page)
+            rows.append((self._corner[0] + i) * _PAGE + at // _PAGE)
+            columns.append((self._corner[1] + j) * _PAGE + at % _PAGE)
+            tiles.append(page[at])
+        squares = np.column_stack([np.concatenate([[], *part]) for part in (rows, columns)])
+        squares = squares.astype(np.int64).reshape(-1, 2)
+        numbers = np.concatenate([np.empty(0, np.int32), *tiles])
+        order = np.lexsort((squares[:, 1], squares[:, 0]))
+        squares, numbers = squares[order], numbers[order]
+        # What was removed leaves tiles that tell nothing.
+        evidence, starts = self._evidence.packed(squares)
+        told = np.array([np.any(self._codes[number] != _FAR) for number in numbers], np.bool_)
+        told |= np.diff(starts) > 0
+        numbers = np.concatenate([[0], numbers[told]]).astype(np.int64)
+        return FieldArrays(
+            squares[told].astype(np.int32),
+            evidence,
+            np.append(starts[:-1][told], starts[-1]),
+            self._coarse[numbers],
+            self._codes[numbers],
         )
 
     def add(self, scan: LaserScan, pose: Pose2D) -> None:
         """Add what a scan taken at ``pose`` (``T_set_laser``) shows."""
-        self._change(self._rays([(scan, pose)]), 1)
+        self._change(scan, pose, 1)
 
     def remove(self, scan: LaserScan, pose: Pose2D) -> None:
         """Take back what ``add`` with the same scan and pose put in."""
-        self._change(self._rays([(scan, pose)]), -1)
+        self._change(scan, pose, -1)
 
-    def _rays(self, scans: Iterable[tuple[LaserScan, Pose2D]]) -> _Rays:
-        origins, ends = [np.empty((0, 2))], [np.empty((0, 2))]
+    def _change(self, scan: LaserScan, pose: Pose2D, sign: int) -> None:
+        for rays in self._batches([(scan, pose)]):
+            touched, dirty = self._deposit(rays, sign)
+            self._derive(touched, dirty)
+            self._publish()
+
+    def _publish(self) -> None:
+        row, column = self._corner
+        self._tiles = Tiles(
+            self._pages.reshape(-1),
+            self._table[: self._table_used].reshape(-1),
+            self._codes[: self._used].reshape(-1),
+            self._coarse[: self._used].reshape(-1),
+            self._pages.shape[1],
+            self._pages.shape[0],
+            column * _PAGE * _SIDE,
+            row * _PAGE * _SIDE,
+            self._settings.resolution,
+            self._settings.reach,
+        )
+        self._published, self._table_published = self._used, self._table_used
+
+    def _batches(self, scans: Iterable[tuple[LaserScan, Pose2D]]) -> Iterator[_Rays]:
+        """Rays of scans, of several at once where these lie together."""
+        batch: list[_Rays] = []
+        count = 0
         for scan, pose in scans:
             points = scan.points
             points = points[np.hypot(points[:, 0], points[:, 1]) <= self._settings.farthest]
-            ends.append(pose.apply(points))
-            origins.append(np.broadcast_to((pose.x, pose.y), points.shape))
-        return _Rays(np.concatenate(origins), np.concatenate(ends))
+            if not len(points):
+                continue
+            ends = pose.apply(points)
+            if not np.isfinite(ends).all():
+                raise AnchorscanError("a reference has a pose that is not finite")
+            rays = _Rays(np.repeat([[pose.x, pose.y]], len(points), axis=0), ends)
+            if batch and (count > _MANY_RAYS or self._are_apart(batch[0], rays)):
+                yield _Rays(*map(np.concatenate, zip(*batch, strict=True)))
+                batch, count = [], 0
+            batch.append(rays)
+            count += len(points)
+        if batch:
+            yield _Rays(*map(np.concatenate, zip(*batch, strict=True)))
 
-    def _change(self, rays: _Rays, sign: int) -> None:
-        if not len(rays.ends):
-            return
-        self._cover(rays)
-        touched = np.zeros(self._table.shape, np.bool_)
-        row, column = self._corner
-        frame = (column * _SIDE, row * _SIDE, self._settings.resolution, self._settings.margin)
-        _touch(rays.origins, rays.ends, touched, frame, self._halo)
-        self._allocate(touched)
-        _deposit(rays.origins, rays.ends, self._table, self._evidence, frame, sign)
-        self._derive(touched)
-        self._tiles = self._snapshot()
+    def _are_apart(self, rays: _Rays, others: _Rays) -> bool:
+        apart = np.abs(rays.origins[0] - others.origins[0]).max()
+        return float(apart) > _WIDEST * _SIDE * self._settings.resolution
 
     @property
     def _halo(self) -> int:
         """Cells within ``reach``."""
         return math.ceil(self._settings.reach / self._settings.resolution)
 
-    def _cover(self, rays: _Rays) -> None:
-        """Widen the table to all that rays tell of and a tile around it."""
-        cells = np.concatenate([rays.origins, rays.ends]) / self._settings.resolution
-        if not np.isfinite(cells).all():
-            raise AnchorscanError("a reference has a pose that is not finite")
-        low = np.floor((cells.min(axis=0) - self._halo) / _SIDE).astype(int) - 1
-        high = np.floor((cells.max(axis=0) + self._halo) / _SIDE).astype(int) + 2
-        row, column = self._corner
-        if self._used > 1:
-            low = np.minimum(low, (column, row))
-            high = np.maximum(high, (column + self._table.shape[1], row + self._table.shape[0]))
-        if float(high[0] - low[0]) * float(high[1] - low[1]) > _MOST_SQUARES:
-            apart = float((high - low).max()) * _SIDE * self._settings.resolution
+    def _deposit(self, rays: _Rays, sign: int) -> tuple[NDArray[np.int64], NDArray[np.uint64]]:
+        """Change the evidence of rays.
+
+        Returns:
+            (N, 2) touched squares in order, and (N, 2) which of their blocks a hit, and which a
+            hit or a pass, has changed.
+        """
+        size = self._settings.resolution
+        cells = np.concatenate([rays.origins, rays.ends]) / size
+        low = np.floor((cells.min(axis=0) - self._halo) / _SIDE)[::-1]
+        high = np.floor((cells.max(axis=0) + self._halo) / _SIDE)[::-1] + 1
+        self._cover(low - 1, high + 1)
+        corner, shape = low.astype(np.int64), (high - low).astype(np.int64)
+        frame = (int(corner[1]) * _SIDE, int(corner[0]) * _SIDE, size, self._settings.margin)
+        is_touched = np.zeros(shape, np.bool_)
+        _touch(rays.origins, rays.ends, is_touched, frame, self._halo)
+        at = np.argwhere(is_touched)
+        rows = np.zeros(shape, np.int32)
+        rows[at[:, 0], at[:, 1]] = self._evidence.rows(at + corner, make=True)
+        dirty = np.zeros((*shape, 2), np.uint64)
+        change = (self._halo, sign)
+        _deposit(rays, rows, self._evidence.layers, dirty, frame, change)
+        return at + corner, dirty[at[:, 0], at[:, 1]]
+
+    def _cover(self, low: NDArray, high: NDArray) -> None:  # type: ignore[type-arg]
+        """Widen the pages to all squares from ``low`` up to ``high``, rows before columns."""
+        low, high = np.floor(low / _PAGE), np.ceil(high / _PAGE)
+        old = np.array(self._corner), np.array(self._corner) + self._pages.shape
+        if self._is_placed:
+            low, high = np.minimum(low, old[0]), np.maximum(high, old[1])
+        shape = high - low
+        if float(shape[0]) * float(shape[1]) > _MOST_PAGES:
+            apart = float(shape.max()) * _PAGE * _SIDE * self._settings.resolution
             raise AnchorscanError(f"references lie {apart / 1e3:.0f} km apart; is a pose wrong?")
-        table = np.zeros((high[1] - low[1], high[0] - low[0]), np.int32)
-        if self._used > 1:
-            if table.shape == self._table.shape:
-                return
-            down, left = row - low[1], column - low[0]
-            table[down : down + self._table.shape[0], left : left + self._table.shape[1]] = (
-                self._table
-            )
-        self._table, self._corner = table, (int(low[1]), int(low[0]))
-
-    def _allocate(self, touched: NDArray[np.bool_]) -> None:
-        """Give every touched square a tile."""
-        new = touched & (self._table == 0)
-        count = int(new.sum())
-        if count == 0:
+        if self._is_placed and tuple(shape.astype(int)) == self._pages.shape:
             return
-        table = self._table.copy()
-        table[new] = np.arange(self._used, self._used + count, dtype=np.int32)
-        need = self._used + count
-        if need > len(self._codes):
-            room = need if self._used == 1 else max(need, 2 * len(self._codes))
-            self._evidence = _Evidence(*(_grown(layer, room, 0) for layer in self._evidence))
-            self._codes = _grown(self._codes, room, _FAR)
-            self._coarse = _grown(self._coarse, room, int(self._coarse[0, 0, 0]))
-        self._table, self._used = table, need
+        pages = np.zeros(shape.astype(int), np.int32)
+        if self._is_placed:
+            i, j = (old[0] - low).astype(int)
+            pages[i : i + self._pages.shape[0], j : j + self._pages.shape[1]] = self._pages
+        self._pages, self._corner = pages, (int(low[0]), int(low[1]))
+        self._is_placed = True
 
-    def _derive(self, touched: NDArray[np.bool_]) -> None:
-        """Bring the bytes of the touched tiles up to date."""
-        rows, columns = np.nonzero(touched)
+    def _derive_all(self, squares: NDArray[np.int64]) -> None:
+        """Derive all bytes of tiles, some at a time."""
+        for first in range(0, len(squares), _GROUP):
+            group = squares[first : first + _GROUP]
+            self._derive(group, np.full((len(group), 2), _ALL_BLOCKS, np.uint64))
+
+    def _derive(self, squares: NDArray[np.int64], dirty: NDArray[np.uint64]) -> None:
+        """Bring the bytes of dirty blocks up to date, in new versions of their tiles."""
         settings = self._settings
+        wide = -(-self._halo // _SIDE)
+        steps = np.arange(-wide, wide + 1)
+        near = np.stack(np.meshgrid(steps, steps, indexing="ij"), axis=-1).reshape(-1, 2)
+        around = (squares[:, np.newaxis] + near).reshape(-1, 2)
+        rows = self._evidence.rows(around, make=False).reshape(len(squares), -1)
         limits = (
             settings.resolution,
             settings.reach,
@@ -256,18 +383,75 @@ class LikelihoodField:
             settings.fewest_passes,
             settings.passes_per_hit,
         )
-        codes, coarse = self._codes.copy(), self._coarse.copy()
-        _derive(rows, columns, self._table, self._evidence, codes, limits)
-        _pool(self._table[rows, columns], codes, coarse, settings.weights())
-        self._codes, self._coarse = codes, coarse
+        tiles = self._renewed(squares)
+        _derive(tiles, rows, dirty, self._evidence.layers, self._codes, limits)
+        _pool(tiles, dirty, self._codes, self._coarse, self._weights)
+
+    def _renewed(self, squares: NDArray[np.int64]) -> NDArray[np.int32]:
+        """Give squares tiles that nobody reads yet, with what theirs held before."""
+        old = self._tiles_of(squares)
+        stale = np.flatnonzero(old < self._published)  # the empty tile is one of them
+        self._make_room(len(stale))
+        old = self._tiles_of(squares)  # which making room may have renumbered
+        new = old.copy()
+        new[stale] = np.arange(self._used, self._used + len(stale), dtype=np.int32)
+        self._codes[new[stale]] = self._codes[old[stale]]
+        self._coarse[new[stale]] = self._coarse[old[stale]]
+        self._used += len(stale)
+        self._live += int((old[stale] == 0).sum())
+        self._point(squares[stale], new[stale])
+        return new
+
+    def _make_room(self, count: int) -> None:
+        """Provide for more tiles: in place of outlived versions where these are the most."""
+        if self._used + count <= len(self._codes):
+            return
+        kept = np.arange(self._used)
+        if self._used > 2 * self._live + _GROUP:
+            kept = np.unique(self._table[np.unique(np.append(self._pages, 0))])
+            numbers = np.zeros(self._used, np.int32)
+            numbers[kept] = np.arange(len(kept), dtype=np.int32)
+            self._table, self._table_published = numbers[self._table], 1
+        room = len(kept) + count + max(len(kept) // 2, _GROUP // 2)
+        self._codes = _grown(self._codes[kept], room)
+        self._coarse = _grown(self._coarse[kept], room)
+        # Nobody reads these copies yet.
+        self._used, self._published = len(kept), 1
+
+    def _tiles_of(self, squares: NDArray[np.int64]) -> NDArray[np.int32]:
+        pages, at = self._places_of(squares)
+        return self._table[self._pages[pages[:, 0], pages[:, 1]], at]
+
+    def _places_of(self, squares: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """(N, 2) page, and (N,) place in it, of squares."""
+        pages = (squares >> 6) - np.array(self._corner)
+        return pages, ((squares[:, 0] & 63) << 6) | (squares[:, 1] & 63)
+
+    def _point(self, squares: NDArray[np.int64], tiles: NDArray[np.int32]) -> None:
+        """Let the table name these tiles for squares, in new versions of its pages."""
+        if not len(squares):
+            return
+        pages, at = self._places_of(squares)
+        directory = self._pages.copy()
+        i, j = np.unique(pages, axis=0).T
+        if self._table_used + len(i) > len(self._table):
+            used, directory = np.unique(np.append(directory, 0), return_inverse=True)
+            directory = directory[:-1].reshape(self._pages.shape).astype(np.int32)
+            self._table = _grown(self._table[used], 2 * (len(used) + len(i)))
+            self._table_used, self._table_published = len(used), 1
+        stale = directory[i, j] < self._table_published
+        i, j = i[stale], j[stale]
+        new = np.arange(self._table_used, self._table_used + len(i), dtype=np.int32)
+        self._table[new] = self._table[directory[i, j]]
+        self._table_used += len(i)
+        directory[i, j] = new
+        self._pages = directory
+        self._table[directory[pages[:, 0], pages[:, 1]], at] = tiles
 
 
-def _no_evidence(count: int) -> _Evidence:
-    return _Evidence(*(np.zeros((count, _SIDE, _SIDE), np.int32) for _ in range(4)))
-
-
-def _grown(layer: NDArray, room: int, fill: int) -> NDArray:  # type: ignore[type-arg]
-    grown = np.full((room, *layer.shape[1:]), fill, layer.dtype)
+def _grown(layer: NDArray, room: int) -> NDArray:  # type: ignore[type-arg]
+    """Copy into a longer array; what is new holds anything."""
+    grown = np.empty((room, *layer.shape[1:]), layer.dtype)
     grown[: len(layer)] = layer
     return grown
 
@@ -301,95 +485,149 @@ def _touch(origins, ends, touched, frame, halo):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _deposit(origins, ends, table, evidence, frame, sign):  # type: ignore[no-untyped-def]
-    """Add the evidence of rays (sign 1), or take it back (sign -1)."""
+def _deposit(rays, rows, layers, dirty, frame, change):  # type: ignore[no-untyped-def]
+    """Add the evidence of rays (sign 1), or take it back (sign -1), and mark the blocks changed."""
     column, row, resolution, margin = frame
-    for i in range(len(ends)):
-        ox, oy, ex, ey = origins[i, 0], origins[i, 1], ends[i, 0], ends[i, 1]
+    halo, sign = change
+    for i in range(len(rays.ends)):
+        ox, oy = rays.origins[i, 0], rays.origins[i, 1]
+        ex, ey = rays.ends[i, 0], rays.ends[i, 1]
         count, dx, dy = _steps(ox, oy, ex, ey, resolution, margin)
         last_x, last_y = -1, -1
         for k in range(count):
             cx = int(math.floor((ox + k * dx) / resolution)) - column
             cy = int(math.floor((oy + k * dy) / resolution)) - row
             if cx != last_x or cy != last_y:
-                evidence.passes[table[cy // _SIDE, cx // _SIDE], cy % _SIDE, cx % _SIDE] += sign
+                v, u = cy % _SIDE, cx % _SIDE
+                layers.passes[rows[cy // _SIDE, cx // _SIDE], v, u] += sign
+                block = _1 << np.uint64(v // _BLOCK * _BLOCKS + u // _BLOCK)
+                dirty[cy // _SIDE, cx // _SIDE, 1] |= block
                 last_x, last_y = cx, cy
         gx, gy = ex / resolution, ey / resolution
         cx = int(math.floor(gx))
         cy = int(math.floor(gy))
-        tile = table[(cy - row) // _SIDE, (cx - column) // _SIDE]
-        v, u = (cy - row) % _SIDE, (cx - column) % _SIDE
-        evidence.hits[tile, v, u] += sign
-        evidence.x[tile, v, u] += sign * int((gx - cx) * _FRACTIONS)
-        evidence.y[tile, v, u] += sign * int((gy - cy) * _FRACTIONS)
+        at_x, at_y = int((gx - cx) * _FRACTIONS), int((gy - cy) * _FRACTIONS)
+        cx -= column
+        cy -= row
+        tile = rows[cy // _SIDE, cx // _SIDE]
+        layers.hits[tile, cy % _SIDE, cx % _SIDE] += sign
+        layers.x[tile, cy % _SIDE, cx % _SIDE] += sign * at_x
+        layers.y[tile, cy % _SIDE, cx % _SIDE] += sign * at_y
+        for v in range((cy - halo) // _BLOCK, (cy + halo) // _BLOCK + 1):
+            for u in range((cx - halo) // _BLOCK, (cx + halo) // _BLOCK + 1):
+                block = _1 << np.uint64(v % _BLOCKS * _BLOCKS + u % _BLOCKS)
+                dirty[v // _BLOCKS, u // _BLOCKS, 0] |= block
+                dirty[v // _BLOCKS, u // _BLOCKS, 1] |= block
 
 
 @kernel
-def _derive(rows, columns, table, evidence, codes, limits):  # type: ignore[no-untyped-def]
-    """Distances, free space and surfaces of the tiles at ``rows`` and ``columns``."""
-    resolution, reach, halo, fewest_passes, passes_per_hit = limits
-    distance = np.empty((_SIDE, _SIDE), np.float32)
-    for n in range(len(rows)):
-        tile = table[rows[n], columns[n]]
-        distance[:] = np.inf
-        for v in range(-halo, _SIDE + halo):
-            for u in range(-halo, _SIDE + halo):
-                r, c = rows[n] + v // _SIDE, columns[n] + u // _SIDE
-                if r < 0 or c < 0 or r >= table.shape[0] or c >= table.shape[1]:
-                    continue
-                other = table[r, c]
-                hits = evidence.hits[other, v % _SIDE, u % _SIDE]
+def _distances(first_v, first_u, around, layers, halo, squares):  # type: ignore[no-untyped-def]
+    """Squared distance to the nearest surface, in cells, for a block of a tile."""
+    squares[:] = np.inf
+    side = int(math.sqrt(len(around)))
+    middle = side // 2
+    for n in range(len(around)):
+        row = around[n]
+        top, left = (n // side - middle) * _SIDE, (n % side - middle) * _SIDE
+        for v in range(
+            max(first_v - halo - top, 0), min(first_v + _BLOCK + halo - top, _SIDE if row else 0)
+        ):
+            for u in range(
+                max(first_u - halo - left, 0), min(first_u + _BLOCK + halo - left, _SIDE)
+            ):
+                hits = layers.hits[row, v, u]
                 if hits <= 0:
                     continue
-                x = u + (evidence.x[other, v % _SIDE, u % _SIDE] / hits + 0.5) / _FRACTIONS
-                y = v + (evidence.y[other, v % _SIDE, u % _SIDE] / hits + 0.5) / _FRACTIONS
-                for j in range(max(0, v - halo), min(_SIDE, v + halo + 1)):
-                    for i in range(max(0, u - halo), min(_SIDE, u + halo + 1)):
-                        off = (i + 0.5 - x) ** 2 + (j + 0.5 - y) ** 2
-                        distance[j, i] = min(distance[j, i], off)
-        for j in range(_SIDE):
-            for i in range(_SIDE):
-                code = int(min(math.sqrt(distance[j, i]) * resolution / reach, 1.0) * _FAR)
-                passes, hits = evidence.passes[tile, j, i], evidence.hits[tile, j, i]
-                if passes >= fewest_passes:
-                    code += _FREE
-                if hits > 0 and passes <= passes_per_hit * hits:
-                    code += _SURFACE
-                codes[tile, j, i] = code
+                x = u + left - first_u + (layers.x[row, v, u] / hits + 0.5) / _FRACTIONS
+                y = v + top - first_v + (layers.y[row, v, u] / hits + 0.5) / _FRACTIONS
+                _lay(np.float32(x), np.float32(y), squares)
 
 
 @kernel
-def _pool(tiles, codes, coarse, weights):  # type: ignore[no-untyped-def]
-    """Best score in every coarse cell."""
+def _lay(x, y, squares):  # type: ignore[no-untyped-def]
+    """Note the squared distance to a point, for the cells of a block that it is nearer to."""
+    for j in range(_BLOCK):
+        up = (_CENTRES[j] - y) * (_CENTRES[j] - y)
+        for i in range(_BLOCK):
+            off = (_CENTRES[i] - x) * (_CENTRES[i] - x) + up
+            squares[j, i] = off if off < squares[j, i] else squares[j, i]
+
+
+@kernel
+def _derive(tiles, around, dirty, layers, codes, limits):  # type: ignore[no-untyped-def]
+    """Distances, free space and surfaces of the dirty blocks of tiles.
+
+    Those that no hit has changed keep their distances.
+    """
+    resolution, reach, halo, fewest_passes, passes_per_hit = limits
+    squares = np.empty((_BLOCK, _BLOCK), np.float32)
+    middle = around.shape[1] // 2
     for n in range(len(tiles)):
-        tile = tiles[n]
-        for j in range(_SIDE // _COARSE):
-            for i in range(_SIDE // _COARSE):
+        own = around[n, middle]
+        for block in range(_BLOCKS * _BLOCKS):
+            if not (dirty[n, 1] >> np.uint64(block)) & _1:
+                continue
+            first_v, first_u = block // _BLOCKS * _BLOCK, block % _BLOCKS * _BLOCK
+            is_hit = (dirty[n, 0] >> np.uint64(block)) & _1
+            if is_hit:
+                _distances(first_v, first_u, around[n], layers, halo, squares)
+            for j in range(_BLOCK):
+                for i in range(_BLOCK):
+                    v, u = first_v + j, first_u + i
+                    code = int(codes[tiles[n], v * _SIDE + u]) & _FAR
+                    if is_hit:
+                        far = math.sqrt(squares[j, i]) * resolution / reach
+                        code = int(min(far, 1.0) * _FAR)
+                    passes, hits = layers.passes[own, v, u], layers.hits[own, v, u]
+                    if passes >= fewest_passes:
+                        code += _FREE
+                    if hits > 0 and passes <= passes_per_hit * hits:
+                        code += _SURFACE
+                    codes[tiles[n], v * _SIDE + u] = code
+
+
+@kernel
+def _pool(tiles, dirty, codes, coarse, weights):  # type: ignore[no-untyped-def]
+    """Best score in every coarse cell of the dirty blocks."""
+    side = _SIDE // _COARSE
+    for n in range(len(tiles)):
+        for j in range(side):
+            for i in range(side):
+                block = j * _COARSE // _BLOCK * _BLOCKS + i * _COARSE // _BLOCK
+                if not (dirty[n, 1] >> np.uint64(block)) & _1:
+                    continue
                 best = np.float32(-1.0)
                 for b in range(_COARSE):
                     for a in range(_COARSE):
-                        score = weights[codes[tile, j * _COARSE + b, i * _COARSE + a]]
-                        best = max(best, score)
-                coarse[tile, j, i] = int(round(127.0 * best))
+                        at = (j * _COARSE + b) * _SIDE + i * _COARSE + a
+                        best = max(best, weights[codes[tiles[n], at]])
+                coarse[tiles[n], j * side + i] = int(round(127.0 * best))
+
+
+@kernel
+def _tile_at(tiles, u, v):  # type: ignore[no-untyped-def]
+    """Tile that covers a square, counted from the border."""
+    page = np.uint64(tiles.pages[(v >> _6) * np.uint64(tiles.width) + (u >> _6)])
+    return np.uint64(tiles.table[(page << _12) | ((v & _63) << _6) | (u & _63)])
 
 
 @kernel
 def cell_code(tiles, cx, cy):  # type: ignore[no-untyped-def]
     """Byte of a cell of the table; the table's border is empty, so beyond it is unknown."""
     # Unsigned indices spare the check for negative ones, which costs more than the look-up.
-    u = np.uint64(min(max(cx, 0), (tiles.width << 6) - 1))
-    v = np.uint64(min(max(cy, 0), (tiles.height << 6) - 1))
-    tile = tiles.table[(v >> _6) * np.uint64(tiles.width) + (u >> _6)]
-    return tiles.codes[(np.uint64(tile) << _12) | ((v & _63) << _6) | (u & _63)]
+    u = np.uint64(min(max(cx, 0), (tiles.width << 12) - 1))
+    v = np.uint64(min(max(cy, 0), (tiles.height << 12) - 1))
+    tile = _tile_at(tiles, u >> _6, v >> _6)
+    return tiles.codes[(tile << _12) | ((v & _63) << _6) | (u & _63)]
 
 
 @kernel
 def coarse_score(tiles, cx, cy):  # type: ignore[no-untyped-def]
     """Best score (127ths) in a coarse cell of the table; 0 beyond its border."""
-    u = np.uint64(min(max(cx, 0), (tiles.width << 4) - 1))
-    v = np.uint64(min(max(cy, 0), (tiles.height << 4) - 1))
-    tile = tiles.table[(v >> _4) * np.uint64(tiles.width) + (u >> _4)]
-    return int(tiles.coarse[(np.uint64(tile) << _8) | ((v & _15) << _4) | (u & _15)])
+    u = np.uint64(min(max(cx, 0), (tiles.width << 10) - 1))
+    v = np.uint64(min(max(cy, 0), (tiles.height << 10) - 1))
+    tile = _tile_at(tiles, u >> _4, v >> _4)
+    return int(tiles.coarse[(tile << _8) | ((v & _15) << _4) | (u & _15)])
 
 
 @kernel
@@ -417,12 +655,11 @@ def _distance_at(tiles, gx, gy):  # type: ignore[no-untyped-def]
     ix, iy = int(gx - 0.5), int(gy - 0.5)
     fx, fy = gx - 0.5 - ix, gy - 0.5 - iy
     unit = tiles.reach / _FAR
-    u = np.uint64(min(max(ix, 0), (tiles.width << 6) - 1))
-    v = np.uint64(min(max(iy, 0), (tiles.height << 6) - 1))
+    u = np.uint64(min(max(ix, 0), (tiles.width << 12) - 1))
+    v = np.uint64(min(max(iy, 0), (tiles.height << 12) - 1))
     if (u & _63) != _63 and (v & _63) != _63:
         # All four cells lie in one tile, as they do for 97 readings of 100.
-        tile = tiles.table[(v >> _6) * np.uint64(tiles.width) + (u >> _6)]
-        at = (np.uint64(tile) << _12) | ((v & _63) << _6) | (u & _63)
+        at = (_tile_at(tiles, u >> _6, v >> _6) << _12) | ((v & _63) << _6) | (u & _63)
         a = (tiles.codes[at] & _FAR) * unit
         b = (tiles.codes[at + _1] & _FAR) * unit
         c = (tiles.codes[at + _64] & _FAR) * unit

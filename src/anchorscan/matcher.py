@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -100,21 +100,54 @@ class Matcher:
         self, references: Iterable[Reference] = (), settings: Settings | None = None
     ) -> None:
         self.settings = settings or Settings.preset("default")
-        known = [self._know(reference) for reference in references]
-        self._known = {each.reference.identifier: each for each in known}
-        if len(self._known) < len(known):
+        singles, placed = [], []
+        for reference in references:
+            (placed if self._fits(reference) else singles).append(reference)
+        if {each.identifier for each in placed} & {each.identifier for each in singles}:
             raise ValueError("two references have the same identifier")
-        self._singles = Pairwise(self.settings, [each for each in known if not self._fits(each)])
-        self._map = StitchedMap(self.settings, [each for each in known if self._fits(each)])
+        self._singles = Pairwise(self.settings, map(self._know, singles))
+        self._map = StitchedMap(self.settings, map(self._know, placed))
         self._writing = threading.Lock()
 
+    @classmethod
+    def from_arrays(
+        cls,
+        arrays: Mapping[str, NDArray[Any]],
+        settings: Settings,
+        read: Callable[[int], Reference],
+    ) -> Matcher:
+        """Take up what ``arrays`` gave, with the same settings.
+
+        Args:
+            arrays: By name; they may be mapped from a file.
+            settings: Of all stages.
+            read: Returns the reference of an identifier, when it is needed.
+
+        Raises:
+            ValueError: The arrays do not fit each other.
+        """
+        places = cls((), settings)
+        places._map = StitchedMap.from_arrays(settings, arrays, read)
+        return places
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """Return all that was derived from the references, as plain arrays by name.
+
+        Raises:
+            ValueError: Some references are not searched as one map; of these there is nothing
+                to be kept.
+        """
+        if len(self._singles):
+            raise ValueError("only references that are searched as one map have an index")
+        return self._map.arrays()
+
     def __len__(self) -> int:
-        return len(self._known)
+        return len(self._map) + len(self._singles)
 
     @property
     def references(self) -> tuple[Reference, ...]:
-        """The references, in the order in which they came."""
-        return tuple(each.reference for each in tuple(self._known.values()))
+        """The references: those of the map, then the others."""
+        return (*self._map.references, *self._singles.references)
 
     def locate(self, scan: LaserScan, candidates: Candidates = None) -> list[Hypothesis]:
         """Say where a scan may have been taken, with no prior.
@@ -185,10 +218,9 @@ class Matcher:
         """
         known = self._know(reference)
         with self._writing:
-            if reference.identifier in self._known:
+            if reference.identifier in self._map or reference.identifier in self._singles:
                 raise ValueError(f"there is a reference {reference.identifier} already")
-            (self._map if self._fits(known) else self._singles).add(known)
-            self._known[reference.identifier] = known
+            (self._map if self._fits(reference) else self._singles).add(known)
 
     def remove(self, identifier: int) -> None:
         """Remove a reference.
@@ -197,9 +229,7 @@ class Matcher:
             KeyError: There is no such reference.
         """
         with self._writing:
-            known = self._known[identifier]
-            (self._map if self._fits(known) else self._singles).remove(identifier)
-            del self._known[identifier]
+            (self._map if identifier in self._map else self._singles).remove(identifier)
 
     def prepare(self) -> None:
         """Compile everything, so that the first real scan does not pay for it."""
@@ -212,8 +242,8 @@ class Matcher:
     def _know(self, reference: Reference) -> Known:
         return Known(reference, describe(reference.scan, self.settings))
 
-    def _fits(self, known: Known) -> bool:
-        return self.settings.method == "map" and known.reference.pose is not None
+    def _fits(self, reference: Reference) -> bool:
+        return self.settings.method == "map" and reference.pose is not None
 
     def _most(self, candidates: Candidates) -> int | None:
         if candidates is None:

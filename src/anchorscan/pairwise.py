@@ -102,6 +102,14 @@ class Pairwise:
     def __len__(self) -> int:
         return len(self._known)
 
+    def __contains__(self, identifier: int) -> bool:
+        return identifier in self._known
+
+    @property
+    def references(self) -> tuple[Reference, ...]:
+        """The references, in the order in which they came."""
+        return tuple(each.reference for each in tuple(self._known.values()))
+
     def add(self, known: Known) -> None:
         """Add a reference.
 

@@ -30,11 +30,20 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
 from ._jit import kernel
-from .anchors import AnchorKind, AnchorPoints
+from .anchors import AnchorKind, AnchorPoints, AnchorStack, stack_anchors
 from .field import Tiles, coarse_score
 from .pose import Pose2D
 
-__all__ = ["Landmarks", "ProposalSettings", "Proposals", "joined", "landmarks", "proposals"]
+__all__ = [
+    "Landmarks",
+    "ProposalSettings",
+    "Proposals",
+    "check_landmarks",
+    "joined",
+    "landmarks",
+    "proposals",
+    "related",
+]
 
 _KINDS = len(AnchorKind)
 # Directions are kept in 65,536ths of a turn: 16-bit differences wrap by themselves.
@@ -125,11 +134,31 @@ def landmarks(
         anchors: Anchor points of each reference and its pose ``T_set_laser``.
         settings: Of the search.
     """
-    positions = np.concatenate([np.empty((0, 2)), *(p.apply(a.positions) for a, p in anchors)])
-    directions = np.concatenate([[], *(a.directions + p.theta for a, p in anchors)])
-    main = np.concatenate([[], *(np.full(len(a), a.main_angle + p.theta) for a, p in anchors)])
-    kinds = np.concatenate([np.empty(0, np.int64), *(a.kinds for a, _ in anchors)])
-    owners = np.repeat(np.arange(len(anchors)), [len(a) for a, _ in anchors])
+    poses = np.array([pose.to_array() for _, pose in anchors]).reshape(-1, 3)
+    return related(stack_anchors([each for each, _ in anchors]), poses, settings)
+
+
+def related(
+    anchors: AnchorStack, poses: NDArray[np.float64], settings: ProposalSettings
+) -> Landmarks:
+    """Do what ``landmarks`` does for many references.
+
+    Args:
+        anchors: Anchor points of the references.
+        poses: (C, 3) ``T_set_laser`` of each.
+        settings: Of the search.
+    """
+    sizes = np.diff(anchors.starts)
+    x, y, theta = np.repeat(poses, sizes, axis=0).T
+    c, s = np.cos(theta), np.sin(theta)
+    positions = np.column_stack(
+        (
+            x + c * anchors.positions[:, 0] - s * anchors.positions[:, 1],
+            y + s * anchors.positions[:, 0] + c * anchors.positions[:, 1],
+        )
+    )
+    kinds, directions = anchors.kinds, anchors.directions + theta
+    main = np.repeat(anchors.main_angles, sizes) + theta
 
     turn = 2.0 * math.pi / max(round(2.0 * math.pi / settings.landmark_turn), 1)
     keys = np.column_stack(
@@ -139,8 +168,7 @@ def landmarks(
             np.floor(np.mod(directions, 2.0 * math.pi) / turn),
         )
     ).astype(np.int64)
-    _, first, member = np.unique(keys, axis=0, return_index=True, return_inverse=True)
-    member = member.reshape(-1)
+    first, member = _alike(keys)
     count = len(first)
     seen = np.bincount(member, minlength=count)
     centre = np.column_stack(
@@ -150,9 +178,8 @@ def landmarks(
         np.bincount(member, np.sin(directions), minlength=count),
         np.bincount(member, np.cos(directions), minlength=count),
     )
-    first_of_owner = np.searchsorted(owners, np.arange(len(anchors) + 1))
-    pairs = _pairs(kinds, member, first_of_owner)
-    a, b = np.unique(pairs, axis=0).T if len(pairs) else np.empty((2, 0), np.int32)
+    pairs = np.unique(_pairs(kinds, member, anchors.starts))
+    a, b = np.divmod(pairs, max(count, 1))
     kinds = kinds[first]
     across = centre[b] - centre[a]
     lengths = np.hypot(across[:, 0], across[:, 1])
@@ -178,6 +205,39 @@ def landmarks(
         turns[order],
         np.searchsorted(group[order], np.arange(_KINDS * _KINDS + 1))[np.newaxis],
     )
+
+
+def _alike(keys: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Sort out equal rows: the first of every kind, in order, and which kind each row is."""
+    order = np.lexsort(keys.T[::-1])
+    is_first = np.ones(len(keys), np.bool_)
+    is_first[1:] = np.any(keys[order[1:]] != keys[order[:-1]], axis=1)
+    member = np.empty(len(keys), np.int64)
+    member[order] = np.cumsum(is_first) - 1
+    return order[is_first], member
+
+
+def check_landmarks(known: Landmarks) -> None:
+    """See that stored landmarks name nothing that is not there.
+
+    Raises:
+        ValueError: They do.
+    """
+    count, edges = len(known.positions), len(known.lengths)
+    starts = known.starts.reshape(-1), known.edge_starts.reshape(-1)
+    if (
+        known.positions.shape != (count, 2)
+        or known.directions.shape != (count, 2)
+        or known.edges.shape != (edges, 2)
+        or known.turns.shape != (edges, 4)
+        or known.starts.shape != (1, _KINDS + 1)
+        or known.edge_starts.shape != (1, _KINDS * _KINDS + 1)
+        or any(np.any(np.diff(each) < 0) or each[0] != 0 for each in starts)
+        or starts[0][-1] != count
+        or starts[1][-1] != edges
+        or (edges and not (known.edges.min() >= 0 and known.edges.max() < count))
+    ):
+        raise ValueError("the landmarks do not fit each other")
 
 
 def joined(parts: Sequence[Landmarks]) -> Landmarks:
@@ -213,12 +273,18 @@ def _askew(angles: NDArray[np.float64]) -> NDArray[np.int16]:
 
 @kernel
 def _pairs(kinds, member, starts):  # type: ignore[no-untyped-def]
-    """All pairs of landmarks that one reference saw together, the lower kind first."""
+    """All pairs of landmarks that one reference saw together, the lower kind first.
+
+    A pair is one integer, the first landmark times the number of all plus the second.
+    """
+    count = 0
+    for landmark in member:
+        count = max(count, landmark + 1)
     total = 0
     for n in range(len(starts) - 1):
         size = starts[n + 1] - starts[n]
         total += size * (size - 1) // 2
-    pairs = np.empty((total, 2), np.int32)
+    pairs = np.empty(total, np.int64)
     found = 0
     for n in range(len(starts) - 1):
         for i in range(starts[n], starts[n + 1]):
@@ -228,8 +294,7 @@ def _pairs(kinds, member, starts):  # type: ignore[no-untyped-def]
                     continue
                 if kinds[i] > kinds[j] or (kinds[i] == kinds[j] and a > b):
                     a, b = b, a
-                pairs[found, 0] = a
-                pairs[found, 1] = b
+                pairs[found] = a * count + b
                 found += 1
     return pairs[:found]
 
@@ -237,7 +302,7 @@ def _pairs(kinds, member, starts):  # type: ignore[no-untyped-def]
 def proposals(
     anchors: AnchorPoints,
     points: NDArray[np.float64],
-    known: Landmarks,
+    known: Landmarks | Sequence[Landmarks],
     tiles: Tiles,
     settings: ProposalSettings,
 ) -> Proposals:
@@ -246,7 +311,7 @@ def proposals(
     Args:
         anchors: Of the scan.
         points: (N, 2) end points of the scan's returns, metres, scan frame.
-        known: Landmarks of the references.
+        known: Landmarks of the references, all of them or several lots.
         tiles: The map stitched from them.
         settings: Of the search.
     """
@@ -259,11 +324,17 @@ def proposals(
         int(settings.direction_tolerance * unit),
         int(settings.heading_tolerance * unit),
         int(settings.lone_heading_tolerance * unit),
-        settings.enough,
-        settings.most,
     )
+    lots = [known] if isinstance(known, Landmarks) else known
+    out = np.empty((_MOST, 3))
+    found = 0
+    for lot in lots:
+        found = _edge_proposals(query, lot, limits, out, found)
+    if found < settings.enough:
+        for lot in lots:
+            found = _lone_proposals(query, lot, limits, out, found)
     chosen = spread(points, settings.readings)
-    return Proposals(*_propose(query, chosen, known, tiles, limits))
+    return Proposals(*_checked(chosen, tiles, out, found, settings.most), found)
 
 
 @kernel
@@ -365,10 +436,9 @@ def _put(out, found, anchor, landmark, units):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _edge_proposals(query, known, limits, out):  # type: ignore[no-untyped-def]
-    """Poses proposed by corresponding oriented edges; returns how many fit into ``out``."""
+def _edge_proposals(query, known, limits, out, found):  # type: ignore[no-untyped-def]
+    """Poses proposed by corresponding oriented edges; appended to ``out`` as long as they fit."""
     positions, kinds, directions, main = query
-    found = 0
     for i in range(len(kinds)):
         for j in range(i + 1, len(kinds)):
             a, b = (i, j) if kinds[i] <= kinds[j] else (j, i)
@@ -451,12 +521,8 @@ def _lone_proposals(query, known, limits, out, found):  # type: ignore[no-untype
 
 
 @kernel
-def _propose(query, chosen, known, tiles, limits):  # type: ignore[no-untyped-def]
-    """Propose, drop what was proposed before, check, and keep the best."""
-    out = np.empty((_MOST, 3))
-    found = _edge_proposals(query, known, limits, out)
-    if found < limits[6]:
-        found = _lone_proposals(query, known, limits, out, found)
+def _checked(chosen, tiles, out, found, most):  # type: ignore[no-untyped-def]
+    """Drop what was proposed before, check the others, and keep the best."""
     table = _rotated(chosen, tiles)
     slots = 64
     while slots < 2 * found:
@@ -474,8 +540,7 @@ def _propose(query, chosen, known, tiles, limits):  # type: ignore[no-untyped-de
             scores[kept] = score
             kept += 1
     full = 127 * max(len(chosen), 1)
-    poses, values = _highest(out[:kept], scores[:kept], full, limits[7])
-    return poses, values, found
+    return _highest(out[:kept], scores[:kept], full, most)
 
 
 @kernel

@@ -19,7 +19,7 @@ import os
 import struct
 import sys
 import threading
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, MutableMapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
@@ -28,6 +28,13 @@ from itertools import islice, product
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from .derived_index import (
+    DerivedIndex,
+    IndexedReferences,
+    index_path,
+    read_index,
+    write_index,
+)
 from .errors import ReferenceSetError, SettingsError
 from .hypothesis import Hypothesis
 from .pose import Pose2D
@@ -41,11 +48,14 @@ from .set_file import (
     BuildState,
     Place,
     Sensor,
+    SetChanges,
     SetContent,
     SetFile,
     create_set,
     number,
+    read_changes,
     read_set,
+    read_summary,
 )
 
 if TYPE_CHECKING:
@@ -59,6 +69,8 @@ if TYPE_CHECKING:
 __all__ = ["ReferenceSet", "SetInfo"]
 
 _BATCH = 256
+# An index that is behind by more than this share of its references is no help.
+_BEHIND_SHARE = 0.25
 _CHUNKS = 8
 
 # Cells a shade wider than the rule: rounding then never puts two neighbours two cells apart.
@@ -86,6 +98,11 @@ class SetInfo:
             None without poses.
         next_identifier: What the next reference will be called.
         build: How it was built from a log, if it was.
+        index: Whether there is an index beside the file: ``none``, ``current``, ``behind`` (by a
+            few references, which are derived on opening), ``outdated`` (of another version, of
+            other settings, too far behind, or damaged: it counts for nothing), or ``unknown``
+            when the settings are not understood.
+        index_size: Bytes of the index, or None.
     """
 
     path: Path | None
@@ -98,6 +115,8 @@ class SetInfo:
     bounds: tuple[float, float, float, float] | None
     next_identifier: int
     build: BuildState | None
+    index: str = "none"
+    index_size: int | None = None
 
 
 class ReferenceSet:
@@ -107,6 +126,9 @@ class ReferenceSet:
     until ``close`` a log lies beside the file.  The references themselves are held in memory: a
     set shows what the file held when it was opened or refreshed, and its own changes.  Sets of
     several processes may share a file; writers take turns.
+
+    Where ``save_index`` has left an index beside the file, opening maps that instead of reading
+    all references and deriving all that they show.
 
     Made by ``build``, ``open``, ``import_directory``, or empty by the constructor.
 
@@ -187,20 +209,27 @@ class ReferenceSet:
 
     @classmethod
     def open(
-        cls, path: str | os.PathLike[str], *, settings: Settings | None = None
+        cls,
+        path: str | os.PathLike[str],
+        *,
+        settings: Settings | None = None,
+        use_index: bool = True,
     ) -> ReferenceSet:
         """Open a set's file; nothing is written to it before the set is changed.
 
         Args:
             path: The file.
             settings: Settings to use instead of those in the file.
+            use_index: Whether to map the index beside the file, if that is current; otherwise
+                every reference in the file is read and verified.
 
         Raises:
             ReferenceSetError: There is no such file, it is of another kind, newer, damaged, or
                 not to be read.
         """
         places = cls.__new__(cls)
-        places._take(read_set(Path(path)), Path(path), settings)
+        if not (use_index and places._take_index(Path(path), settings)):
+            places._take(read_set(Path(path)), Path(path), settings)
         return places
 
     @classmethod
@@ -239,13 +268,31 @@ class ReferenceSet:
         self._is_closed = False
         self._adopt(content)
 
+    def _take_index(self, path: Path, settings: Settings | None) -> bool:
+        """Take the set from its index and what has changed since, if the index counts."""
+        found = _read_indexed(path, settings)
+        if found is None:
+            return False
+        index, changes = found
+        self._take(changes.content, path, settings)
+        references = IndexedReferences(index)
+        for identifier in changes.gone.tolist():
+            del references[identifier]
+        for reference in changes.content.references:
+            references[reference.identifier] = reference
+        self._references, self._listed, self._index = references, None, index
+        return True
+
     def _adopt(self, content: SetContent) -> None:
         self.name = content.name
         self._stored_settings = content.settings
         self._settings = self._given_settings
         self._build = content.build
         self._next_identifier = content.next_identifier
-        self._references = {reference.identifier: reference for reference in content.references}
+        self._references: MutableMapping[int, Reference] = {
+            reference.identifier: reference for reference in content.references
+        }
+        self._index: DerivedIndex | None = None
         self._listed: tuple[Reference, ...] | None = content.references
         self._matcher: Matcher | None = None
 
@@ -318,7 +365,22 @@ class ReferenceSet:
             bounds,
             self._next_identifier,
             self._build,
+            *self._index_state(),
         )
+
+    def _index_state(self) -> tuple[str, int | None]:
+        """Say what there is of an index, and its size."""
+        if self.path is None or not index_path(self.path).is_file():
+            return "none", None
+        size = index_path(self.path).stat().st_size
+        try:
+            found = _read_indexed(self.path, self.settings)
+        except SettingsError:
+            return "unknown", size
+        if found is None:
+            return "outdated", size
+        _, changes = found
+        return "behind" if len(changes.gone) or changes.content.references else "current", size
 
     def add(self, scan: LaserScan, pose: Pose2D | None = None, name: str = "") -> int:
         """Add a reference.
@@ -473,6 +535,28 @@ class ReferenceSet:
         """Do now what the first query would wait for: derive the index, compile kernels."""
         self._prepared().prepare()
 
+    def save_index(self) -> None:
+        """Write what is derived from the references beside the set's file, for later openings.
+
+        An index of all references takes as long as the first query of a set without one, and
+        some three kilobytes a reference; ``derived_index`` says what is in it.  Where the index
+        is current nothing is written.
+
+        Raises:
+            ReferenceSetError: The set has no file, has references that are not searched as one
+                map, or the index cannot be written; an index that was there is as it was.
+        """
+        if self.path is None:
+            raise ReferenceSetError("a set in memory has no index; save it to a file and open that")
+        with self._lock:
+            if self._index_state()[0] == "current":
+                return
+            try:
+                derived = self._prepared().arrays()
+            except ValueError as error:
+                raise ReferenceSetError(f"{self.path}: {error}") from None
+            write_index(self.path, self.references, derived, self.settings)
+
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the set to a file, whole or not at all; the set stays with the file it has.
 
@@ -530,11 +614,31 @@ class ReferenceSet:
 
     def _prepared(self) -> Matcher:
         if self._matcher is None:
-            from .matcher import Matcher
-
             with self._lock:
-                self._matcher = Matcher(*self._matched())
+                if self._matcher is None:
+                    self._matcher = self._indexed() or self._derived()
         return self._matcher
+
+    def _derived(self) -> Matcher:
+        from .matcher import Matcher
+
+        return Matcher(*self._matched())
+
+    def _indexed(self) -> Matcher | None:
+        """Make the matcher of the index and what has changed since."""
+        if self._index is None or not isinstance(self._references, IndexedReferences):
+            return None
+        from .matcher import Matcher
+
+        try:
+            matcher = Matcher.from_arrays(self._index.arrays, self.settings, self._index.read)
+        except (ValueError, KeyError, IndexError):
+            return None  # it contradicts itself: then it is as good as none
+        for identifier in self._references.gone:
+            matcher.remove(identifier)
+        for reference in self._references.added:
+            matcher.add(reference)
+        return matcher
 
     def _matched(self) -> tuple[tuple[Reference, ...], Settings]:
         """Return what a matcher is made of."""
@@ -640,6 +744,32 @@ class ReferenceSet:
         self._listed = None
         if self._matcher is not None:
             self._matcher.remove(identifier)
+
+
+def _read_indexed(path: Path, settings: Settings | None) -> tuple[DerivedIndex, SetChanges] | None:
+    """Read the index of a set and what has changed since, if the index counts.
+
+    Raises:
+        ReferenceSetError: The set's file is damaged, or cannot be read.
+    """
+    if not index_path(path).is_file():
+        return None
+    if settings is None:
+        from .settings import Settings
+
+        stored = read_summary(path).settings
+        try:
+            settings = Settings.from_json(stored) if stored else Settings.preset()
+        except SettingsError:
+            return None
+    index = read_index(path, settings)
+    if index is None:
+        return None
+    changes = read_changes(path, index.identifiers, index.checksums)
+    if changes is None:
+        return None
+    count = len(changes.gone) + len(changes.content.references)
+    return (index, changes) if count <= _BEHIND_SHARE * len(index.identifiers) else None
 
 
 class _Neighbourhood:

@@ -1,8 +1,9 @@
 """The one file that a reference set is kept in: scans, poses, names, sensors, settings.
 
 The file is an SQLite database of format 1, marked by ``APPLICATION`` in its header.  What
-anchors and edges can be computed from is stored; anchors and edges are not, so nothing in the
-file can grow stale.  A reference is written once and never changed:
+anchors and edges can be computed from is stored; anchors and edges are not (``derived_index``
+keeps them beside it), so nothing in the file can grow stale.  A reference is written once and
+never changed:
 
 * ``reference``: a row per reference, the ranges as little-endian float32 exactly as given,
   ``T_set_laser`` as three numbers or three NULLs, and a checksum over everything the row means;
@@ -37,6 +38,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .errors import ReferenceSetError, ScanError
 from .pose import Pose2D
@@ -51,11 +53,15 @@ __all__ = [
     "BuildState",
     "Place",
     "Sensor",
+    "SetChanges",
     "SetContent",
     "SetFile",
+    "checksum_of",
     "create_set",
     "number",
+    "read_changes",
     "read_set",
+    "read_summary",
 ]
 
 APPLICATION = 0x41505253
@@ -224,6 +230,19 @@ class SetContent:
         _check_name(self.name)
         if len(self.settings.encode()) > _LONGEST_SETTINGS:
             raise ReferenceSetError(f"settings of over {_LONGEST_SETTINGS} bytes are refused")
+
+
+@dataclass(frozen=True, eq=False)
+class SetChanges:
+    """How a file differs from what somebody knew of it.
+
+    Args:
+        content: The set, with only those references that are new.
+        gone: (G,) identifiers of references that are no longer there.
+    """
+
+    content: SetContent
+    gone: NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -465,6 +484,86 @@ def read_set(path: Path) -> SetContent:
             references,
             _load_build(connection),
         )
+
+
+def read_summary(path: Path) -> SetContent:
+    """Read a file without its references.
+
+    Raises:
+        ReferenceSetError: As for ``read_set``.
+    """
+    _check_file(path)
+    with _told(path), closing(_connect_to_read(path)) as connection:
+        connection.execute("BEGIN")
+        _check_schema(connection)
+        header = _load_header(connection)
+        build = _load_build(connection)
+    return SetContent(header.name, header.settings, header.next_identifier, (), build)
+
+
+def read_changes(
+    path: Path, identifiers: NDArray[np.int64], checksums: NDArray[np.int64]
+) -> SetChanges | None:
+    """Read only what of a file is not known yet.
+
+    That takes no time where nothing has changed; otherwise the checksums of all references are
+    read, and the new references.
+
+    Args:
+        path: The file.
+        identifiers: (N,) of the references that are known, ascending.
+        checksums: (N,) of these.
+
+    Returns:
+        The changes; None where the file is not a later state of what is known.
+
+    Raises:
+        ReferenceSetError: As for ``read_set``.
+    """
+    _check_file(path)
+    with _told(path), closing(_connect_to_read(path)) as connection:
+        connection.execute("BEGIN")
+        _check_schema(connection)
+        header = _load_header(connection)
+        gone, new = np.empty(0, np.int64), []
+        known = len(identifiers), int(np.bitwise_xor.reduce(checksums, initial=0))
+        if known != (header.count, header.content):
+            rows = connection.execute(
+                """SELECT identifier, checksum FROM reference
+                    WHERE typeof(checksum) = 'integer' ORDER BY identifier"""
+            ).fetchall()
+            there, theirs = np.array(rows, np.int64).reshape(-1, 2).T
+            at = np.searchsorted(identifiers, there)
+            at[at == len(identifiers)] = 0
+            is_known = identifiers[at] == there if len(identifiers) else np.zeros(len(at), np.bool_)
+            if np.any(checksums[at[is_known]] != theirs[is_known]):
+                return None
+            gone = np.setdiff1d(identifiers, there[is_known], assume_unique=True)
+            new = there[~is_known].tolist()
+            if (len(there), int(np.bitwise_xor.reduce(theirs, initial=0))) != (
+                header.count,
+                header.content,
+            ):
+                raise _DamageError(f"of its {header.count} references {len(there)} could be found")
+        if header.next_identifier <= (int(identifiers[-1]) if len(identifiers) else -1):
+            return None
+        references = tuple(_load_some(connection, new))
+        content = SetContent(
+            header.name,
+            header.settings,
+            header.next_identifier,
+            references,
+            _load_build(connection),
+        )
+    return SetChanges(content, gone)
+
+
+def checksum_of(reference: Reference) -> int:
+    """Return the checksum over everything that a reference means."""
+    sensor, pose = Sensor.of(reference.scan), reference.pose
+    place = (None,) * 3 if pose is None else (pose.x + 0.0, pose.y + 0.0, pose.theta + 0.0)
+    values = (reference.identifier, *astuple(sensor), *place, reference.name)
+    return _seal(*values, data=reference.scan.ranges.astype("<f4", copy=False).tobytes())
 
 
 class _DamageError(Exception):
@@ -763,6 +862,18 @@ def _load_references(connection: sqlite3.Connection, header: _Header) -> Iterato
         yield reference
     if (count, content) != (header.count, header.content) or last >= header.next_identifier:
         raise _DamageError(f"of its {header.count} references {count} could be found")
+
+
+def _load_some(connection: sqlite3.Connection, identifiers: Sequence[int]) -> Iterator[Reference]:
+    """Read single references, and verify them."""
+    select = _SELECT_REFERENCES.replace(
+        "ORDER BY reference.identifier", "WHERE reference.identifier = ?"
+    )
+    for identifier in identifiers:
+        row = connection.execute(select, (identifier,)).fetchone()
+        if row is None or not _are(row, _ROW_TYPES):
+            raise _DamageError(f"reference {identifier} has values of the wrong kind or size")
+        yield _reference(row)[0]
 
 
 def _reference(row: tuple[Any, ...]) -> tuple[Reference, int]:

@@ -9,30 +9,46 @@ from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from functools import cached_property
+from functools import reduce
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ._jit import kernel
-from .angle_function import wrapped
+from .anchors import AnchorStack, stack_anchors
 from .database import RelationshipDatabase, Votes, quality
 from .decision import Decision, covariance, decide
-from .description import Description
+from .description import Description, describe
 from .evaluation import evaluate_all, stack_outlines
-from .field import LikelihoodField, Tiles
+from .field import FieldArrays, LikelihoodField, Tiles
+from .graph import anchor_graph
 from .hypothesis import Hypothesis
 from .pairwise import Known
+from .placed import Lot, lot_of, nearest, tidied
 from .pose import Pose2D
-from .proposal import Landmarks, Proposals, ProposalSettings, joined, landmarks, proposals
+from .proposal import (
+    Landmarks,
+    Proposals,
+    check_landmarks,
+    joined,
+    landmarks,
+    proposals,
+    related,
+)
 from .reference import Reference
 from .scan import LaserScan
 from .settings import Settings
 from .verification import Fits, follow, verify
 
 __all__ = ["MapSearch", "StitchedMap"]
+
+# What is known of so many references, some fifty megabytes, is kept; of others it is made again.
+_REMEMBERED = 4096
+_MOST_STANDING = 2048
+
+Value = TypeVar("Value")
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,33 +77,27 @@ class _Content:
     """What a search reads, replaced as a whole by a writer.
 
     Args:
-        known: The references by their identifiers.
+        lots: The references.
         tiles: The field stitched from them.
-        settings: Of the landmarks.
+        count: References that are there.
     """
 
-    known: dict[int, Known]
+    lots: tuple[Lot, ...]
     tiles: Tiles
-    settings: ProposalSettings
+    count: int
 
-    @cached_property
-    def identifiers(self) -> NDArray[np.int64]:
-        """(N,) ascending."""
-        return np.array(sorted(self.known), np.int64)
+    def find(self, identifier: int) -> tuple[Lot, int] | None:
+        """Tell in which lot and where there a reference is."""
+        for lot in self.lots:
+            place = lot.find(identifier)
+            if place is not None:
+                return lot, place
+        return None
 
-    @cached_property
-    def poses(self) -> NDArray[np.float64]:
-        """(N, 3) ``T_set_scan`` of the references, in the order of their identifiers."""
-        placed = [_placed(self.known[identifier])[1] for identifier in self.identifiers.tolist()]
-        return np.array([pose.to_array() for pose in placed]).reshape(-1, 3)
-
-    @cached_property
-    def landmarks(self) -> Landmarks:
+    @property
+    def landmarks(self) -> list[Landmarks]:
         """Those of all references."""
-        known = [self.known[identifier] for identifier in self.identifiers.tolist()]
-        return landmarks(
-            [(each.description.anchors, _placed(each)[1]) for each in known], self.settings
-        )
+        return [lot.landmarks for lot in self.lots]
 
 
 class StitchedMap:
@@ -96,22 +106,101 @@ class StitchedMap:
     Args:
         settings: Of all stages.
         known: References to begin with, all with a pose.
+
+    Raises:
+        ValueError: Two references have the same identifier, or one has no pose.
     """
 
     def __init__(self, settings: Settings, known: Iterable[Known] = ()) -> None:
-        begin = list(known)
+        self._begin(settings, _no_reading)
+        lot = lot_of(map(self._remembered, known), 0, settings.proposal)
+        self._next_serial = len(lot)
+        references = [reference for reference in lot.references if reference is not None]
+        self._field = LikelihoodField(settings.field, map(_placed, references))
+        self._hold((lot,))
+
+    @classmethod
+    def from_arrays(
+        cls,
+        settings: Settings,
+        arrays: Mapping[str, NDArray[Any]],
+        read: Callable[[int], Reference],
+    ) -> StitchedMap:
+        """Take up a map as ``arrays`` gave it, with the same settings; little is copied.
+
+        Args:
+            settings: Of all stages.
+            arrays: By name; they may be mapped from a file.
+            read: Returns the reference of an identifier, when it is needed.
+
+        Raises:
+            ValueError: The arrays do not fit each other.
+        """
+        places = cls.__new__(cls)
+        places._begin(settings, read)
+        try:
+            lot = _lot_from(arrays, settings)
+        except (KeyError, TypeError) as error:
+            raise ValueError(f"arrays of the map are missing: {error}") from None
+        places._next_serial = len(lot)
+        places._database = RelationshipDatabase.from_arrays(
+            settings.database, _section(arrays, "database.")
+        )
+        # Removed references leave their slots, so these may be in another order.
+        if not np.array_equal(np.sort(arrays["database.identifiers"]), lot.identifiers):
+            raise ValueError("the relationship database is of other references")
+        field = FieldArrays._make(arrays[f"field.{name}"] for name in FieldArrays._fields)
+        places._field = LikelihoodField.from_arrays(settings.field, field)
+        places._hold((lot,))
+        return places
+
+    def _begin(self, settings: Settings, read: Callable[[int], Reference]) -> None:
         self._settings = settings
+        self._read = read
         self._weights = settings.field.weights()
         self._readings = settings.belief.readings(settings.field)
         # Made when votes are first asked for: without them all references propose.
         self._preparing = threading.Lock()
         self._database: RelationshipDatabase | None = None
-        self._relations: dict[int, tuple[Known, Landmarks]] = {}
-        self._field = LikelihoodField(settings.field, (_placed(each) for each in begin))
-        self._hold({each.reference.identifier: each for each in begin})
+        self._relations = _Memory[Landmarks]()
+        self._memory = _Memory[Known]()
 
     def __len__(self) -> int:
-        return len(self._content.known)
+        return self._content.count
+
+    def __contains__(self, identifier: int) -> bool:
+        return self._content.find(identifier) is not None
+
+    @property
+    def references(self) -> tuple[Reference, ...]:
+        """The references in the order of their identifiers."""
+        found = [
+            self._reference(lot, place)
+            for lot in self._content.lots
+            for place in np.flatnonzero(lot.is_there).tolist()
+        ]
+        return tuple(sorted(found, key=lambda reference: reference.identifier))
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """Return all that is derived from the references, as plain arrays by name."""
+        with self._preparing:
+            lot = reduce(Lot.followed_by, self._content.lots)
+            lot = lot.followed_by(lot_of((), 0, lot.settings))  # which leaves out what is gone
+            found = {
+                "references.identifiers": lot.identifiers,
+                "references.poses": lot.poses,
+                **{f"anchors.{name}": array for name, array in vars(lot.anchors).items()},
+                **self._stored_landmarks(lot),
+                **{f"field.{name}": each for name, each in self._field.arrays()._asdict().items()},
+            }
+        database = self._voting().arrays()
+        return found | {f"database.{name}": array for name, array in database.items()}
+
+    def _stored_landmarks(self, lot: Lot) -> dict[str, NDArray[Any]]:
+        """Landmarks of all references, unless only those that are voted for propose."""
+        if self._settings.database.candidates is not None:
+            return {}
+        return {f"landmarks.{name}": each for name, each in lot.landmarks._asdict().items()}
 
     def add(self, known: Known) -> None:
         """Add a reference that has a pose.
@@ -121,10 +210,15 @@ class StitchedMap:
         """
         identifier = known.reference.identifier
         with self._preparing:
-            self._field.add(*_placed(known))  # first, since it may refuse
+            if self._content.find(identifier) is not None:
+                raise ValueError(f"there is a reference {identifier} already")
+            lot = lot_of([known], self._next_serial, self._settings.proposal)
+            self._field.add(*_placed(known.reference))  # first, since it may refuse
             if self._database is not None:
                 self._database.add(identifier, known.description.graph)
-            self._hold({**self._content.known, identifier: known})
+            self._memory[self._next_serial] = known
+            self._next_serial += 1
+            self._hold(tidied([*self._content.lots, lot]))
 
     def remove(self, identifier: int) -> None:
         """Remove a reference.
@@ -133,13 +227,15 @@ class StitchedMap:
             KeyError: There is no such reference.
         """
         with self._preparing:
-            left = dict(self._content.known)
-            known = left.pop(identifier)
+            found = self._content.find(identifier)
+            if found is None:
+                raise KeyError(identifier)
+            lot, place = found
+            self._field.remove(*_placed(self._reference(lot, place)))
             if self._database is not None:
                 self._database.remove(identifier)
-            self._relations.pop(identifier, None)
-            self._field.remove(*_placed(known))
-            self._hold(left)
+            left = lot.without(place)
+            self._hold(tidied([left if each is lot else each for each in self._content.lots]))
 
     def search(self, description: Description, most: int | None) -> MapSearch:
         """Let relations propose poses, sieve and refine them, and decide.
@@ -152,14 +248,14 @@ class StitchedMap:
         tiles = content.tiles
         points = description.angles.points
         votes = None if most is None else self._voting().votes(description.graph, most)
-        known = content.landmarks if votes is None else self._some(votes.references, content)
-        proposed = proposals(description.anchors, points, known, tiles, settings.proposal)
+        related = content.landmarks if votes is None else self._some(votes.references, content)
+        proposed = proposals(description.anchors, points, related, tiles, settings.proposal)
         if not len(proposed.poses):
             proposed = _standing(content)
         fits = verify(proposed.poses, points, tiles, self._weights, settings.verification)
         decision = decide(fits, len(description.anchors), settings.decision)
-        hypotheses = self._hypotheses(description, fits, decision, content)
-        references = tuple(content.known[each.reference].reference for each in hypotheses)
+        hypotheses, known = self._hypotheses(description, fits, decision, content)
+        references = tuple(each.reference for each in known)
         return MapSearch(votes, proposed, fits, decision, references, hypotheses)
 
     def follow(
@@ -175,18 +271,26 @@ class StitchedMap:
         Returns:
             (K,) identifiers and (K, 3) ``T_reference_laser``.
         """
-        content = self._content
-        nearest, T_reference_scan = _stand_for(content.poses, poses)
-        return content.identifiers[nearest], T_reference_scan
+        lots = self._content.lots
+        numbers, places, T_reference_scan = nearest(lots, poses)
+        identifiers = [
+            lots[n].identifiers[k] for n, k in zip(numbers.tolist(), places.tolist(), strict=True)
+        ]
+        return np.array(identifiers, np.int64), T_reference_scan
 
     def _hypotheses(
         self, description: Description, fits: Fits, decision: Decision, content: _Content
-    ) -> tuple[Hypothesis, ...]:
+    ) -> tuple[tuple[Hypothesis, ...], list[Known]]:
         """Name for each of the best fits the reference taken nearest, and compare with it."""
         settings = self._settings
         count = min(len(fits), settings.acceptance.hypotheses)
-        nearest, T_reference_scan = _stand_for(content.poses, fits.poses[:count])
-        known = [content.known[identifier] for identifier in content.identifiers[nearest].tolist()]
+        numbers, places, T_reference_scan = nearest(content.lots, fits.poses[:count])
+        if np.any(numbers < 0):  # the last reference was removed meanwhile
+            return (), []
+        known = [
+            self._know(content.lots[n], k)
+            for n, k in zip(numbers.tolist(), places.tolist(), strict=True)
+        ]
         e_m = evaluate_all(
             description.outline,
             stack_outlines([each.description.outline for each in known]),
@@ -195,7 +299,7 @@ class StitchedMap:
             settings.evaluation,
         )
         covariances = covariance(fits, settings.decision)
-        return tuple(
+        hypotheses = tuple(
             Hypothesis(
                 reference=each.reference.identifier,
                 pose_in_reference=Pose2D(*T_reference_scan[n].tolist()),
@@ -209,69 +313,119 @@ class StitchedMap:
             )
             for n, each in enumerate(known)
         )
+        return hypotheses, known
 
-    def _hold(self, known: dict[int, Known]) -> None:
-        self._content = _Content(known, self._field.tiles, self._settings.proposal)
+    def _hold(self, lots: tuple[Lot, ...]) -> None:
+        self._content = _Content(lots, self._field.tiles, sum(map(len, lots)))
 
     def _voting(self) -> RelationshipDatabase:
         with self._preparing:
             if self._database is None:
                 self._database = RelationshipDatabase(
                     self._settings.database,
-                    ((k, each.description.graph) for k, each in self._content.known.items()),
+                    (
+                        (identifier, anchor_graph(lot.anchors.of(place), self._settings.graph))
+                        for lot in self._content.lots
+                        for place, identifier in enumerate(lot.identifiers.tolist())
+                        if lot.is_there[place]
+                    ),
                 )
             return self._database
 
     def _some(self, identifiers: NDArray[np.int64], content: _Content) -> Landmarks:
         """Join the relations of single references, less any removed in between."""
-        known = [content.known.get(identifier) for identifier in identifiers.tolist()]
-        parts = [self._related(each) for each in known if each is not None]
+        found = [content.find(identifier) for identifier in identifiers.tolist()]
+        parts = [self._related(*each) for each in found if each is not None]
         return joined(parts) if parts else landmarks([], self._settings.proposal)
 
-    def _related(self, known: Known) -> Landmarks:
-        identifier = known.reference.identifier
-        made_of, relations = self._relations.get(identifier, (None, None))
-        if relations is None or made_of is not known:
-            anchors = [(known.description.anchors, _placed(known)[1])]
-            relations = landmarks(anchors, self._settings.proposal)
-            self._relations[identifier] = known, relations
+    def _related(self, lot: Lot, place: int) -> Landmarks:
+        serial = int(lot.serials[place])
+        relations = self._relations.get(serial)
+        if relations is None:
+            anchors = stack_anchors([lot.anchors.of(place)])
+            pose = lot.poses[place : place + 1]
+            relations = self._relations[serial] = related(anchors, pose, lot.settings)
         return relations
+
+    def _know(self, lot: Lot, place: int) -> Known:
+        serial = int(lot.serials[place])
+        known = self._memory.get(serial)
+        if known is None:
+            reference = self._reference(lot, place)
+            known = Known(reference, describe(reference.scan, self._settings))
+            self._memory[serial] = known
+        return known
+
+    def _reference(self, lot: Lot, place: int) -> Reference:
+        return lot.references[place] or self._read(int(lot.identifiers[place]))
+
+    def _remembered(self, known: Known) -> Known:
+        """Keep what is known of references to begin with, as far as there is room."""
+        if len(self._memory) < _REMEMBERED:
+            self._memory[len(self._memory)] = known
+        return known
+
+
+class _Memory(dict[int, Value]):
+    """Values that can be made again: beyond a number of them the oldest goes."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._changing = threading.Lock()
+
+    def __setitem__(self, serial: int, value: Value) -> None:
+        with self._changing:
+            if len(self) >= _REMEMBERED:
+                del self[next(iter(self))]
+            super().__setitem__(serial, value)
+
+
+def _no_reading(identifier: int) -> Reference:
+    raise ValueError(f"reference {identifier} is not in memory")
+
+
+def _section(arrays: Mapping[str, NDArray[Any]], prefix: str) -> dict[str, NDArray[Any]]:
+    return {
+        name.removeprefix(prefix): each for name, each in arrays.items() if name.startswith(prefix)
+    }
+
+
+def _lot_from(arrays: Mapping[str, NDArray[Any]], settings: Settings) -> Lot:
+    """Make a lot of stored arrays, whose landmarks are there already."""
+    anchors = AnchorStack(**_section(arrays, "anchors."))
+    identifiers, poses = arrays["references.identifiers"], arrays["references.poses"]
+    count = len(identifiers)
+    lot = Lot(
+        identifiers,
+        np.arange(count),
+        poses,
+        anchors,
+        [None] * count,
+        np.ones(count, np.bool_),
+        settings.proposal,
+    )
+    lot.check()
+    landmarks = _section(arrays, "landmarks.")
+    if landmarks:
+        stored = Landmarks(**landmarks)
+        check_landmarks(stored)
+        lot.__dict__["landmarks"] = stored
+    return lot
 
 
 def _standing(content: _Content) -> Proposals:
-    """Return the poses of the references: a scan without anchors may stand at any."""
-    poses = np.concatenate([content.poses, content.poses + np.array([0.0, 0.0, math.pi])])
+    """Return poses of references: a scan without anchors may stand at any.
+
+    Of very many, some: such a scan says nothing anyway.
+    """
+    step = -(-content.count // _MOST_STANDING) or 1
+    poses = np.concatenate([lot.poses[::step][lot.is_there[::step]] for lot in content.lots])
+    poses = np.concatenate([poses, poses + np.array([0.0, 0.0, math.pi])])
     return Proposals(poses, np.zeros(len(poses)), len(poses))
 
 
-def _placed(known: Known) -> tuple[LaserScan, Pose2D]:
+def _placed(reference: Reference) -> tuple[LaserScan, Pose2D]:
     """Scan and pose of a reference that has one."""
-    if known.reference.pose is None:
-        raise ValueError(f"reference {known.reference.identifier} has no pose")
-    return known.reference.scan, known.reference.pose
-
-
-@kernel
-def _stand_for(references, poses):  # type: ignore[no-untyped-def]
-    """Index of the reference taken nearest to each pose, and ``T_reference_scan``.
-
-    A radian of turn counts as a metre.
-    """
-    nearest = np.zeros(len(poses), np.int64)
-    relative = np.empty((len(poses), 3))
-    for p in range(len(poses)):
-        best = np.inf
-        for r in range(len(references)):
-            dx, dy = poses[p, 0] - references[r, 0], poses[p, 1] - references[r, 1]
-            distance = math.hypot(dx, dy)
-            if distance >= best:
-                continue
-            distance += abs(wrapped(references[r, 2] - poses[p, 2]))
-            if distance < best:
-                best = distance
-                nearest[p] = r
-                c, s = math.cos(references[r, 2]), math.sin(references[r, 2])
-                relative[p, 0] = c * dx + s * dy
-                relative[p, 1] = c * dy - s * dx
-                relative[p, 2] = wrapped(poses[p, 2] - references[r, 2])
-    return nearest, relative
+    if reference.pose is None:
+        raise ValueError(f"reference {reference.identifier} has no pose")
+    return reference.scan, reference.pose
