@@ -403,7 +403,7 @@ def test_the_service_keeps_to_its_own_description(folder: Path) -> None:
         modes = (schemathesis.GenerationMode.POSITIVE, schemathesis.GenerationMode.NEGATIVE)
         for operation, mode in itertools.product(operations, modes):
 
-            @hypothesis.settings(max_examples=20, database=None, derandomize=True)
+            @hypothesis.settings(max_examples=10, database=None, derandomize=True)
             @hypothesis.given(operation.as_strategy(generation_mode=mode))
             def check(case: Any) -> None:
                 # A scan can fit the description and still be none: limits out of order.
