@@ -24,7 +24,7 @@ import platform
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from importlib import metadata
 from itertools import permutations
 from pathlib import Path
@@ -34,7 +34,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import __version__
-from .errors import AnchorscanError, MissingExtraError
+from .cluster import Spread
+from .errors import AnchorscanError, LogError, MissingExtraError
 from .exhaustive_search import ExhaustiveSearch
 from .io import open_log
 from .karto_matcher import KartoMatcher
@@ -104,6 +105,8 @@ _TRUTH_TURN = math.radians(0.3)
 _DATA = "../shared/data"
 _SUFFIXES = (".log", ".clf", ".g2o", ".log.gz", ".clf.gz", ".g2o.gz", ".g2o.zip")
 _WARM_UP = 3
+# Queries that a worker takes at once.
+_CHUNK = 64
 _STAGE_QUERIES = 200
 _MARGIN_WEIGHT = 0.75
 _KARTO_CANDIDATES = 5
@@ -249,6 +252,7 @@ def run(
     baseline_queries: int | None = 136,
     say: Callable[[str], None] = lambda line: None,
     progress: ProgressOf = lambda items, what, total=None: items,
+    spread: Spread | None = None,
 ) -> Scoreboard:
     """Measure presets and baselines by the protocols, and keep what was found.
 
@@ -267,9 +271,13 @@ def run(
             of the presets; None for as many.
         say: Takes the lines of the tables and messages.
         progress: Wraps what takes a while.
+        spread: Shares the queries among workers, which must find the logs under the same paths;
+            None asks them all here.  The answers are the same, but for their times.
+
+    A log that cannot be read is named, and the others are measured.
 
     Raises:
-        AnchorscanError: There are no logs, a log cannot be read, a name is unknown, or no split
+        AnchorscanError: There are no logs, none can be read, a name is unknown, or no split
             has a query.
         OSError: The folder cannot be written.
     """
@@ -290,19 +298,32 @@ def run(
         *_baseline_methods(baselines, baseline_queries, say),
     ]
     paths = list(logs) or default_logs(say)
-    drives = read_drives(progress(paths, "reading", len(paths)))
+    drives, unread = _readable(progress(paths, "reading", len(paths)), len(paths))
     todo = tasks(drives, protocols)
     for drive in drives:
         if not any(drive in (task.known, task.asked) for task in todo):
             say(f"{drive.name}: no protocol finds a query in it")
     if not todo:
         raise AnchorscanError("no split has a query: the drives visit no place twice")
-    scores: list[Score] = []
-    stages: list[StageTimes] = []
-    for task in todo:
-        scores += measure(task, methods, queries, seed, progress)
-        if task.protocol in ("P1", "P3"):
-            stages += _stages(task, methods, queries, seed)
+    if spread is None or not spread.workers:
+        scores = [each for task in todo for each in measure(task, methods, queries, seed, progress)]
+    else:
+        known = [str(path) for path in paths if str(path) not in unread]
+        plan = _Plan(
+            tuple(known),
+            tuple(protocols),
+            tuple((name, preset.to_json()) for name, preset in settings.items()),
+            tuple(candidates),
+            tuple(baselines),
+            baseline_queries,
+        )
+        scores = _measure_spread(plan, todo, methods, queries, seed, progress, spread)
+    stages = [
+        each
+        for task in todo
+        if task.protocol in ("P1", "P3")
+        for each in _stages(task, methods, queries, seed)
+    ]
     board = Scoreboard(
         scores=(*scores, *pooled([s for s in scores if _is_pooled(s)])),
         comparisons=tuple(compared([s for s in scores if s.protocol != "P4"], "exhaustive")),
@@ -314,6 +335,8 @@ def run(
         say(line)
     if output_folder is not None:
         _keep(board, Path(output_folder), say)
+    for reason in unread.values():
+        say(f"not read: {reason}")
     return board
 
 
@@ -385,6 +408,31 @@ def read_drives(logs: Iterable[str | Path]) -> list[Drive]:
     return list(drives.values())
 
 
+def _readable(logs: Iterable[str | Path], count: int) -> tuple[list[Drive], dict[str, str]]:
+    """Read the logs that can be read; give the reasons for the others by their names.
+
+    Raises:
+        LogError: There is but one log, and it cannot be read.
+        AnchorscanError: None can be read, or two have the same name.
+    """
+    drives: list[Drive] = []
+    unread: dict[str, str] = {}
+    for log in logs:
+        try:
+            (drive,) = read_drives([log])
+        except LogError as error:
+            if count == 1:
+                raise
+            unread[str(log)] = str(error)
+            continue
+        if any(drive.name == other.name for other in drives):
+            raise AnchorscanError(f"two logs are called {drive.name}: rename one of them")
+        drives.append(drive)
+    if unread and not drives:
+        raise AnchorscanError(f"no log can be read: {next(iter(unread.values()))}")
+    return drives, unread
+
+
 def tasks(drives: Sequence[Drive], protocols: Sequence[str] = PROTOCOLS) -> list[Task]:
     """Make the splits of all protocols, those without a query left out.
 
@@ -453,12 +501,11 @@ def measure(
         seed: Moves where the steps begin.
         progress: Wraps the queries.
     """
-    chosen = thin(task.split.queries, queries, seed)
     scores = []
     for method in methods:
-        if task.protocol not in method.protocols:
+        asked = _asked(task, method, queries, seed)
+        if not asked:
             continue
-        asked = thin(chosen, method.queries, seed)
         locate = method.prepare(task.references)
         for position in asked[:_WARM_UP]:
             locate(_scan(task, position))
@@ -466,12 +513,93 @@ def measure(
         answers = tuple(
             _ask(task, locate, position) for position in progress(asked, what, len(asked))
         )
-        if answers:
-            number = len(task.references)
-            scores.append(
-                Score(task.protocol, task.place, method.name, number, answers, method.calibrated)
-            )
+        scores.append(_score(task, method, answers))
     return scores
+
+
+def _asked(task: Task, method: Method, queries: int | None, seed: int) -> tuple[int, ...]:
+    """Give the positions of the queries that a method is asked."""
+    if task.protocol not in method.protocols:
+        return ()
+    return thin(thin(task.split.queries, queries, seed), method.queries, seed)
+
+
+def _score(task: Task, method: Method, answers: tuple[Answer, ...]) -> Score:
+    number = len(task.references)
+    return Score(task.protocol, task.place, method.name, number, answers, method.calibrated)
+
+
+@dataclass(frozen=True)
+class _Plan:
+    """From which another process makes the same splits and methods."""
+
+    logs: tuple[str, ...]
+    protocols: tuple[str, ...]
+    presets: tuple[tuple[str, str], ...]
+    candidates: tuple[Candidates, ...]
+    baselines: tuple[str, ...]
+    baseline_queries: int | None
+
+
+@dataclass(frozen=True)
+class _Piece:
+    """Some queries of one split for one method, by their numbers in the plan."""
+
+    plan: _Plan
+    task: int
+    method: int
+    queries: tuple[int, ...]
+
+
+def _measure_spread(
+    plan: _Plan,
+    todo: Sequence[Task],
+    methods: Sequence[Method],
+    queries: int | None,
+    seed: int,
+    progress: ProgressOf,
+    spread: Spread,
+) -> list[Score]:
+    """Do as ``measure`` for all splits, in pieces."""
+    pieces = [
+        _Piece(plan, t, m, asked[start : start + _CHUNK])
+        for t, task in enumerate(todo)
+        for m, method in enumerate(methods)
+        for asked in [_asked(task, method, queries, seed)]
+        for start in range(0, len(asked), _CHUNK)
+    ]
+    answers: dict[tuple[int, int], list[Answer]] = {}
+    for done in progress(spread.map(_answers, pieces), "asking", len(pieces)):
+        if done.value is None:
+            raise AnchorscanError(str(done.error))
+        answers.setdefault((done.item.task, done.item.method), []).extend(done.value)
+    return [_score(todo[t], methods[m], tuple(given)) for (t, m), given in answers.items()]
+
+
+@lru_cache(maxsize=1)
+def _planned(plan: _Plan) -> tuple[list[Task], list[Method]]:
+    """Read the logs once in every process."""
+    settings = {name: Settings.from_json(text) for name, text in plan.presets}
+    methods = [
+        *preset_methods(settings, plan.candidates),
+        *_baseline_methods(plan.baselines, plan.baseline_queries, lambda line: None),
+    ]
+    return tasks(read_drives(plan.logs), plan.protocols), methods
+
+
+@lru_cache(maxsize=2)
+def _ready(plan: _Plan, task: int, method: int) -> Locate:
+    todo, methods = _planned(plan)
+    return methods[method].prepare(todo[task].references)
+
+
+def _answers(piece: _Piece) -> list[Answer]:
+    """Answer the queries of a piece, in a worker."""
+    task = _planned(piece.plan)[0][piece.task]
+    locate = _ready(piece.plan, piece.task, piece.method)
+    for position in piece.queries[:_WARM_UP]:
+        locate(_scan(task, position))
+    return [_ask(task, locate, position) for position in piece.queries]
 
 
 def _ask(task: Task, locate: Locate, position: int) -> Answer:

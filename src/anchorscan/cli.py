@@ -17,7 +17,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from enum import Enum
 from functools import wraps
 from itertools import islice
@@ -31,6 +31,7 @@ from .errors import AnchorscanError, LogError, SettingsError
 
 if TYPE_CHECKING:
     from .answers import ScanAnswer
+    from .cluster import Spread
     from .fleet import Fleet
     from .hypothesis import Hypothesis
     from .io import Log
@@ -218,6 +219,16 @@ SettingsOption = Annotated[
 ]
 
 
+SchedulerOption = Annotated[
+    str | None,
+    typer.Option(metavar="ADDRESS", help="Share the work among the workers of a Dask scheduler."),
+]
+WorkersOption = Annotated[
+    int | None,
+    typer.Option(min=1, metavar="N", help="Share the work among processes of this machine."),
+]
+
+
 @app.command()
 @_guarded
 def build(
@@ -263,6 +274,11 @@ def build(
             "once. Without either, from 1000 references on."
         ),
     ] = None,
+    each: Annotated[
+        bool, typer.Option("--each", help="A set for every log or map, in the folder SET.")
+    ] = False,
+    scheduler: SchedulerOption = None,
+    workers: WorkersOption = None,
 ) -> None:
     """Make a reference set from the scans of logs with poses.
 
@@ -270,40 +286,171 @@ def build(
     In a map (YAML beside PGM or PNG, as map_server has it), references are the scans that the
     laser would take at places spread over all that a robot can reach: by default one that looks
     all around, up to 30 m.
-    """
-    from .reference_set import ReferenceSet
 
+    Of several logs, one that cannot be read is named and left out.
+    """
     settings = _read_settings(preset, settings_file)
     is_map = any(log.suffix.lower() in _MAP_SUFFIXES for log in logs)
-    usual = (1.5, 90.0) if is_map else (2.0, 45.0)
-    spacing = usual[0] if spacing is None else spacing
-    heading = math.radians(usual[1] if heading is None else heading)
-    if is_map:
-        if len(logs) > 1 or topic or poses or laser or upside_down:
-            raise typer.BadParameter("a map is built from alone: no other logs, no topics or poses")
-        records = _map_records(logs[0], field_of_view, range_max, spacing, heading)
-    else:
-        options = {
-            **_reading(field_of_view, range_max, topic, upside_down),
-            **{"poses": poses, "poses_of": poses_of.value, "T_base_laser": laser},
-        }
-        opened = [_open_log(log, options) for log in logs]
-        records = _progress(_records(*opened), "reading", _total(*opened))
+    if is_map and (topic or poses or laser or upside_down or (len(logs) > 1 and not each)):
+        raise typer.BadParameter("a map is built from alone: no other logs, no topics or poses")
+    recipe = _Recipe(
+        _reading(field_of_view, range_max, topic, upside_down),
+        {"poses": poses, "poses_of": poses_of.value, "T_base_laser": laser},
+        spacing,
+        None if heading is None else math.radians(heading),
+        keep_all,
+        None if settings is None else settings.to_json(),
+    )
+    from .cluster import cluster
+
+    if each:
+        with cluster(scheduler, workers) as spread:
+            _build_each(recipe, logs, output, index, spread)
+        return
+    if len(logs) == 1 and scheduler is None and workers is None:
+        _say(_built(recipe, logs[0], recipe.records(logs[0], _progress), output))
+        _write_index(output, index)
+        return
+    unread: list[str] = []
+    with cluster(scheduler, workers) as spread:
+        read = _progress(_read_logs(recipe, logs, spread, unread), "reading")
+        _say(_built(recipe, logs[0], read, output))
+    _write_index(output, index)
+    _tell_unread(unread, len(logs))
+
+
+@dataclass(frozen=True)
+class _Recipe:
+    """How a set is made of logs or of a map; plain values that another process can use."""
+
+    reading: dict[str, Any]
+    posing: dict[str, Any]
+    spacing: float | None
+    heading: float | None
+    keep_all: bool
+    settings: str | None
+
+    def records(self, path: Path, progress: Callable[..., Iterator[Record]]) -> Iterator[Record]:
+        """Read a log, or take scans in a map."""
+        if _is_map(path):
+            taken = _map_records(
+                path, self.reading["field_of_view"], self.reading["range_max"], *self.rule(path)
+            )
+            return progress(taken, "simulating")
+        log = _open_log(path, {**self.reading, **self.posing})
+        return progress(_records(log), "reading", log.count)
+
+    def rule(self, path: Path) -> tuple[float, float]:
+        """Give metres and radians between references."""
+        usual = (1.5, math.radians(90.0)) if _is_map(path) else (2.0, math.radians(45.0))
+        spacing = usual[0] if self.spacing is None else self.spacing
+        return spacing, usual[1] if self.heading is None else self.heading
+
+
+def _is_map(path: Path) -> bool:
+    return path.suffix.lower() in _MAP_SUFFIXES
+
+
+def _built(recipe: _Recipe, source: Path, records: Iterable[Record], output: Path) -> str:
+    """Build one set, and say what it holds."""
+    from .reference_set import ReferenceSet
+    from .settings import Settings
+
+    spacing, heading = recipe.rule(source)
     with ReferenceSet.build(
         records,
         spacing=spacing,
         heading=heading,
-        keep_all=keep_all or is_map,  # coverage of a map is decided already
-        settings=settings,
+        keep_all=recipe.keep_all or _is_map(source),  # coverage of a map is decided already
+        settings=None if recipe.settings is None else Settings.from_json(recipe.settings),
         path=output,
     ) as places:
         info = places.info()
-        _say(f"{output}: {info.references} references{_source(info)}")
+    return f"{output}: {info.references} references{_source(info)}"
+
+
+def _read_logs(
+    recipe: _Recipe, logs: list[Path], spread: Spread, unread: list[str]
+) -> Iterator[Record]:
+    """Give the records of logs that were read whole, in their order."""
+    for done in spread.map(_read_piece, [(recipe, log) for log in logs]):
+        if done.value is None:
+            unread.append(str(done.error))
+            continue
+        records, told = done.value
+        for line in told:
+            _say(line)
+        yield from records
+
+
+def _read_piece(piece: tuple[_Recipe, Path]) -> tuple[list[Record], list[str]]:
+    """Read one log, in whatever process."""
+    recipe, path = piece
+    log = _open_log(path, {**recipe.reading, **recipe.posing})
+    records = list(log)
+    return records, [*(f"note: {log.path}: {note}" for note in log.notes), *_problems(log)]
+
+
+def _write_index(path: Path, wanted: bool | None) -> None:
+    """Write the index of a set that was built, if it is wanted or worth it."""
+    from .reference_set import ReferenceSet
+
+    with ReferenceSet.open(path) as places:
+        info = places.info()
         is_map_of_all = info.with_pose == info.references and places.settings.method == "map"
-        if index or (index is None and is_map_of_all and info.references >= _WORTH_AN_INDEX):
+        if wanted or (wanted is None and is_map_of_all and info.references >= _WORTH_AN_INDEX):
             places.save_index()
             size = places.info().index_size or 0
-            _say(f"{output}.index: {size:,} bytes, derived from it")
+            _say(f"{path}.index: {size:,} bytes, derived from it")
+
+
+def _build_each(
+    recipe: _Recipe, logs: list[Path], folder: Path, index: bool | None, spread: Spread
+) -> None:
+    """Build a set of every log or map; those that are there already are left alone."""
+    folder.mkdir(parents=True, exist_ok=True)
+    targets = {log: folder / f"{_stem(log)}.apr" for log in logs}
+    if len(set(targets.values())) < len(targets):
+        raise typer.BadParameter("two logs have the same name: their sets would, too")
+    left = [log for log in logs if not targets[log].exists()]
+    unread: list[str] = []
+    pieces = spread.map(_set_piece, [(recipe, log) for log in left])
+    for done in _progress(pieces, "building", len(left)):
+        log = done.item[1]
+        if done.value is None:
+            unread.append(str(done.error))
+            continue
+        data, told = done.value
+        draft = targets[log].with_name(f".{targets[log].name}.{os.getpid()}.part")
+        try:
+            draft.write_bytes(data)
+            draft.replace(targets[log])
+        finally:
+            draft.unlink(missing_ok=True)
+        _say(f"{targets[log]}: {told}")
+        _write_index(targets[log], index)
+    if len(left) < len(logs):
+        _say(f"{len(logs) - len(left)} were there already")
+    _tell_unread(unread, len(logs))
+
+
+def _set_piece(piece: tuple[_Recipe, Path]) -> tuple[bytes, str]:
+    """Build one set, in whatever process, and give its file."""
+    import tempfile
+
+    recipe, path = piece
+    with tempfile.TemporaryDirectory(prefix="anchorscan-") as folder:
+        output = Path(folder) / "set.apr"
+        told = _built(recipe, path, recipe.records(path, lambda items, *_: iter(items)), output)
+        return output.read_bytes(), told.partition(": ")[2]
+
+
+def _tell_unread(unread: list[str], count: int) -> None:
+    """Name what was left out; then not all was done that was asked."""
+    for reason in unread:
+        _say(f"left out: {reason}")
+    if unread:
+        raise AnchorscanError(f"{len(unread)} of {count} could not be read or used")
 
 
 @app.command()
@@ -745,6 +892,8 @@ def bench(
         int, typer.Option(min=1, metavar="N", help="The same for the baselines, which are slow.")
     ] = 136,
     seed: Annotated[int, typer.Option(help="Chooses the queries, where not all are asked.")] = 0,
+    scheduler: SchedulerOption = None,
+    workers: WorkersOption = None,
 ) -> None:
     """Measure how well and how fast scans are located, by fixed protocols.
 
@@ -752,6 +901,7 @@ def bench(
     robot on the move, runs on its own.
     """
     from .benchmark import BASELINES, PROTOCOLS, run
+    from .cluster import cluster
 
     if protocols and "P5" in protocols:
         _bench_lost_robot(logs, baselines, queries, baseline_queries, seed, output)
@@ -759,19 +909,21 @@ def bench(
         if not protocols:
             return
         baselines = None if baselines is None else [n for n in baselines if n != "amcl"] or ["none"]
-    run(
-        logs or (),
-        presets=presets or ("default",),
-        protocols=protocols or PROTOCOLS,
-        candidates=candidates or (None, 1, 5, "all"),
-        output_folder=output,
-        queries=queries,
-        seed=seed,
-        baselines=() if baselines == ["none"] else baselines or BASELINES,
-        baseline_queries=baseline_queries,
-        say=typer.echo,
-        progress=_progress,
-    )
+    with cluster(scheduler, workers) as spread:
+        run(
+            logs or (),
+            presets=presets or ("default",),
+            protocols=protocols or PROTOCOLS,
+            candidates=candidates or (None, 1, 5, "all"),
+            output_folder=output,
+            queries=queries,
+            seed=seed,
+            baselines=() if baselines == ["none"] else baselines or BASELINES,
+            baseline_queries=baseline_queries,
+            say=typer.echo,
+            progress=_progress,
+            spread=spread,
+        )
 
 
 @app.command()
@@ -887,6 +1039,37 @@ def bench_fleet(
         say=typer.echo,
         progress=_progress,
     )
+
+
+@app.command()
+@_guarded
+def bench_service(
+    set_file: SetArgument,
+    log: LogArgument,
+    workers: Annotated[
+        int, typer.Option(min=1, metavar="N", help="Worker processes of the service.")
+    ] = 1,
+    clients: Annotated[
+        int, typer.Option(min=1, max=64, metavar="N", help="Clients that ask at once.")
+    ] = 2,
+    queries: Annotated[
+        int, typer.Option(min=1, max=1_000_000, metavar="N", help="Questions of each, at most.")
+    ] = 2000,
+    seconds: Annotated[
+        float, typer.Option(min=1.0, max=600.0, metavar="S", help="To go on for, at most.")
+    ] = 20.0,
+    batch: Annotated[
+        int, typer.Option(min=1, max=1000, metavar="N", help="Scans in a question.")
+    ] = 1,
+    field_of_view: FieldOfViewOption = None,
+) -> None:
+    """Load a service of this machine with the scans of a log, beside the same calls in process."""
+    from .service_benchmark import run
+
+    opened = _open_log(log, _reading(field_of_view, None, None, False))
+    scans = [record.scan for record in _records(opened) if record.scan is not None]
+    for line in run(set_file, scans, workers, clients, queries, seconds, batch):
+        typer.echo(line)
 
 
 @app.command()
@@ -1349,26 +1532,23 @@ def _record(log: Log, index: int) -> Record:
     raise LogError(f"has {count} scans, from 0 on: no scan {index}", log.path)
 
 
-def _total(*logs: Log) -> int | None:
-    total = 0
-    for log in logs:
-        if log.count is None:
-            return None
-        total += log.count
-    return total
-
-
 def _report_problems(log: Log) -> None:
-    """Say once which lines of a log were no use, by number and first reason."""
+    """Say once which lines of a log were no use."""
+    for line in _problems(log):
+        _say(line)
+
+
+def _problems(log: Log) -> list[str]:
+    """Return a line that names the lines of no use by number, and the first reason; or none."""
     if not log.problem_count:
-        return
+        return []
     first = [str(problem.line) for problem in log.problems[:_NAMED_LINES]]
     more = ", ..." if log.problem_count > len(first) else ""
     lines = "line" if log.problem_count == 1 else "lines"
-    _say(
+    return [
         f"warning: {log.path}: {log.problem_count} malformed {lines} "
         f"({', '.join(first)}{more}); the first: {log.problems[0].reason}"
-    )
+    ]
 
 
 def _read_settings(preset: str | None, path: Path | None) -> Settings | None:

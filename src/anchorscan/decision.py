@@ -47,7 +47,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from ._jit import kernel
 from .verification import FEATURES, Fits, worth
 
-__all__ = ["Decision", "DecisionSettings", "covariance", "decide", "evidence", "held"]
+__all__ = ["Decision", "DecisionSettings", "covariance", "decide", "evidence", "held", "worths"]
 
 _SCORE, _THROUGH = FEATURES.index("score"), FEATURES.index("through")
 _SMALLEST_MARGIN, _LARGEST_SCORE = 0.003, 0.995
@@ -81,6 +81,18 @@ class DecisionSettings(BaseModel):
         5.0, gt=0.0, description="standard deviation where nothing holds the pose, metres, radians"
     )
 
+    @property
+    def weights(self) -> tuple[float, ...]:
+        """Of the numbers of ``evidence``, in their order."""
+        return (
+            self.constant,
+            self.log_margin,
+            self.explained,
+            self.through,
+            self.heading,
+            self.anchors,
+        )
+
 
 @dataclass(frozen=True, eq=False)
 class Decision:
@@ -107,7 +119,7 @@ def evidence(fits: Fits, anchors: int) -> NDArray[np.float64]:
         anchors: How many anchor points the scan has.
     """
     score, through = (float(fits.features[0, k]) for k in (_SCORE, _THROUGH))
-    rival = _worths(fits[1:2])[0] if len(fits) > 1 else worth(0.5 * score, 0.0)
+    rival = worths(fits[1:2])[0] if len(fits) > 1 else worth(0.5 * score, 0.0)
     margin = max(worth(score, through) - rival, _SMALLEST_MARGIN)
     rest = 1.0 - min(score, _LARGEST_SCORE)
     rest += _LUCKY_READINGS * max(0.0, 1.0 / max(fits.readings, 1) - 1.0 / _MANY_READINGS)
@@ -184,17 +196,9 @@ def decide(fits: Fits, anchors: int, settings: DecisionSettings) -> Decision:
     """
     if not len(fits):
         return Decision(np.empty(0), 1.0, False)
-    weights = (
-        settings.constant,
-        settings.log_margin,
-        settings.explained,
-        settings.through,
-        settings.heading,
-        settings.anchors,
-    )
-    place = _logistic(float(np.dot(evidence(fits, anchors), weights)))
+    place = _logistic(float(np.dot(evidence(fits, anchors), settings.weights)))
     best = place * held(covariance(fits[:1], settings)[0])
-    left = np.append(_worths(fits[1:]), worth(settings.elsewhere, 0.0))
+    left = np.append(worths(fits[1:]), worth(settings.elsewhere, 0.0))
     rivals = np.exp(settings.rivalry * (left - left.max()))
     shares = (1.0 - best) * rivals[:-1] / rivals.sum()
     probabilities = np.array([best, *np.minimum(shares, best)])
@@ -202,7 +206,7 @@ def decide(fits: Fits, anchors: int, settings: DecisionSettings) -> Decision:
     return Decision(probabilities, elsewhere, best >= settings.threshold)
 
 
-def _worths(fits: Fits) -> NDArray[np.float64]:
+def worths(fits: Fits) -> NDArray[np.float64]:
     """Return (F,) what the fits are ordered by."""
     return np.array([worth(*pair) for pair in fits.features[:, [_SCORE, _THROUGH]].tolist()])
 

@@ -39,7 +39,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from .decision import DecisionSettings, decide
+from .decision import DecisionSettings, decide, worths
 from .errors import ReferenceSetError, SettingsError
 from .hypothesis import Hypothesis
 from .reference_set import ReferenceSet
@@ -78,11 +78,13 @@ class BuildingFits:
 
     Args:
         building: Name of the set.
-        fits: Best score first, as many as there are hypotheses.
+        anchors: How many anchor points the scan has.
+        fits: Of the highest worth first, as many as there are hypotheses.
         hypotheses: One for every fit; their probabilities know of this set alone.
     """
 
     building: str
+    anchors: int
     fits: Fits
     hypotheses: tuple[Hypothesis, ...]
 
@@ -201,7 +203,9 @@ def search(sets: Iterable[tuple[str, ReferenceSet]], scan: LaserScan) -> Iterato
         trace = places.explain(scan)
         if trace.in_map is not None and trace.hypotheses:
             count = len(trace.in_map.hypotheses)
-            yield BuildingFits(name, trace.in_map.fits[:count], trace.in_map.hypotheses)
+            anchors = len(trace.description.anchors)
+            fits = trace.in_map.fits[:count]
+            yield BuildingFits(name, anchors, fits, trace.in_map.hypotheses)
 
 
 def decide_over(
@@ -225,7 +229,8 @@ def decide_over(
         return []
     best, fits = ranked(found)
     harder = settings.constant - look_alikes * math.log(max(sets, 1))
-    decision = decide(fits, settings.model_copy(update={"constant": harder}))
+    anchors = best[0][0].anchors
+    decision = decide(fits, anchors, settings.model_copy(update={"constant": harder}))
     probabilities = decision.probabilities.tolist()
     rival = next((k for k, (each, _) in enumerate(best) if each is not best[0][0]), None)
     if rival is not None:
@@ -254,19 +259,19 @@ def no_twin(margin: float) -> float:
 
 
 def ranked(found: Sequence[BuildingFits]) -> tuple[list[tuple[BuildingFits, int]], Fits]:
-    """Put the fits of many sets into one order, best score first.
+    """Put the fits of many sets into one order, of the highest worth first.
 
     Returns:
         For each of the best, as many as one set has at most, its set and its number there; and
         the fits themselves.
     """
     most = max(len(each.fits) for each in found)
-    scores = [
-        (-score, each.building, place, n)
+    order = [
+        (-worth, each.building, place, n)
         for place, each in enumerate(found)
-        for n, score in enumerate(each.fits.features[:, _SCORE].tolist())
+        for n, worth in enumerate(worths(each.fits).tolist())
     ]
-    best = [(found[place], n) for _, _, place, n in sorted(scores)[:most]]
+    best = [(found[place], n) for _, _, place, n in sorted(order)[:most]]
     return best, _joined([each.fits[n : n + 1] for each, n in best])
 
 

@@ -102,7 +102,7 @@ class Outcome:
         asked: The query.
         sets: N.
         is_known: Whether its building was among them.
-        evidence: (4,) of the best fit of all.
+        evidence: (6,) of the best fit of all.
         held: How likely a pose of its covariance is to be near enough.
         ceiling: The most that its margin to the best other building lets it be worth.
         is_right_building: Whether that fit is in the right building.
@@ -240,7 +240,7 @@ def outcomes(
             continue
         best, fits = ranked(given)
         within = held(covariance(fits[:1], settings)[0])
-        speaks = evidence(fits)
+        speaks = evidence(fits, best[0][0].anchors)
         right = is_known and best[0][0].building == asked.building
         found_pose = Pose2D.from_array(fits.poses[0])
         near = (
@@ -260,8 +260,7 @@ def probabilities(
     results: Sequence[Outcome], look_alikes: float, settings: DecisionSettings
 ) -> NDArray[np.float64]:
     """Return (R,) what the decision over N sets says of each best fit."""
-    weights = (settings.constant, settings.log_margin, settings.explained, settings.through)
-    speaks = np.array([each.evidence for each in results]) @ np.array(weights)
+    speaks = np.array([each.evidence for each in results]) @ np.array(settings.weights)
     speaks -= look_alikes * np.log([each.sets for each in results])
     likely: NDArray[np.float64] = np.array([each.held for each in results])
     likely /= 1.0 + np.exp(-speaks)
@@ -343,7 +342,7 @@ def _timed(name: str, places: ReferenceSet, scan: LaserScan) -> tuple[BuildingFi
     seconds = time.perf_counter() - start
     if found is None:
         return None, seconds
-    return BuildingFits(name, found.fits[:_KEPT_FITS], ()), seconds
+    return BuildingFits(name, found.anchors, found.fits[:_KEPT_FITS], ()), seconds
 
 
 def _thinned(case: Case, queries: int, seed: int) -> Iterator[tuple[LaserScan, Pose2D]]:

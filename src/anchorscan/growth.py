@@ -37,7 +37,6 @@ from numpy.typing import NDArray
 from .anchors import AnchorPoints
 from .array_file import read_arrays, write_arrays
 from .database import RelationshipDatabase
-from .decision import decide
 from .description import Description, describe
 from .errors import MissingExtraError
 from .field import LikelihoodField
@@ -295,7 +294,7 @@ class _Asked:
         related = joined([self._landmarks[number] for number in some])
         proposed = proposals(description.anchors, points, related, self._tiles, settings.proposal)
         fits = verify(proposed.poses, points, self._tiles, self._weights, settings.verification)
-        if not len(fits) or not len(decide(fits, settings.decision).probabilities):
+        if not len(fits):
             return False
         found = Pose2D(*fits.poses[0].tolist())
         return found.distance(truth) <= CORRECT_POSITION and found.turn(truth) <= CORRECT_HEADING

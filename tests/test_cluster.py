@@ -1,0 +1,151 @@
+"""Work in pieces comes out the same on a cluster, whoever dies."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from as_a_user import run, write_log
+
+from anchorscan import AnchorscanError, LogError, benchmark, drive, random_building
+from anchorscan.cluster import Spread, cluster
+
+ITEMS = list(range(12))
+
+
+def squared(number: int) -> int:
+    if number == 5:
+        raise LogError("cannot be read", "five.log")
+    return number * number
+
+
+def counted(piece: tuple[str, int]) -> int:
+    """Leave a mark for every time that a piece is begun; the first of number 3 dies of it."""
+    folder, number = piece
+    begun = len(list(Path(folder).glob(f"{number}-*")))
+    (Path(folder) / f"{number}-{begun}").touch()
+    if number == 3 and not begun:
+        os.kill(os.getpid(), signal.SIGKILL)
+    time.sleep(0.02)
+    return number
+
+
+@pytest.fixture(scope="module")
+def two_workers() -> Iterator[Spread]:
+    pytest.importorskip("distributed", reason="the cluster is an extra")
+    with cluster(workers=2) as spread:
+        yield spread
+
+
+def test_pieces_come_back_in_order_and_a_known_error_stops_nothing() -> None:
+    done = list(Spread().map(squared, ITEMS))
+    assert [each.item for each in done] == ITEMS
+    assert [each.value for each in done] == [n * n if n != 5 else None for n in ITEMS]
+    assert str(done[5].error) == "five.log: cannot be read"
+
+
+def test_a_cluster_gives_what_one_process_gives(two_workers: Spread) -> None:
+    assert two_workers.workers == 2
+
+    def shown(spread: Spread) -> list[object]:
+        return [(each.item, each.value, str(each.error)) for each in spread.map(squared, ITEMS)]
+
+    assert shown(two_workers) == shown(Spread())
+
+
+def test_a_killed_worker_costs_only_its_running_piece(two_workers: Spread, tmp_path: Path) -> None:
+    pieces = [(str(tmp_path), number) for number in ITEMS]
+    done = list(two_workers.map(counted, pieces))
+    assert [each.value for each in done] == ITEMS
+    begun = [len(list(tmp_path.glob(f"{number}-*"))) for number in ITEMS]
+    assert begun[3] == 2
+    assert sum(begun) <= len(ITEMS) + 2
+
+
+def test_bench_answers_the_same_on_a_cluster(two_workers: Spread, tmp_path: Path) -> None:
+    logs = []
+    for seed in (11, 12):
+        records = drive(random_building(seed, length=24.0, depth=14.0), seed=seed, length=90.0)
+        logs.append(write_log(tmp_path / f"b{seed}.log", records[::2]))
+    bad = tmp_path / "bad.log"
+    bad.write_text("nonsense\n")
+
+    def answers(spread: Spread | None) -> tuple[list[object], list[str]]:
+        said: list[str] = []
+        board = benchmark.run(
+            [*logs, bad],
+            protocols=("P1", "P4"),
+            candidates=(None,),
+            queries=20,
+            baselines=(),
+            say=said.append,
+            spread=spread,
+        )
+        facts = [
+            (s.protocol, s.place, s.method, [_timeless(answer) for answer in s.answers])
+            for s in board.scores
+        ]
+        return facts, [line for line in said if "not read" in line]
+
+    here, there = answers(None), answers(two_workers)
+    assert here == there
+    assert len(here[0]) > 2
+    assert "bad.log" in here[1][0]
+
+
+def _timeless(answer: benchmark.Answer) -> object:
+    spread = None if answer.covariance is None else answer.covariance.tolist()
+    return replace(answer, seconds=0.0, covariance=None).__dict__, spread
+
+
+def test_build_names_a_log_that_cannot_be_read_and_takes_the_others(tmp_path: Path) -> None:
+    building = random_building(11, length=24.0, depth=14.0)
+    first = write_log(tmp_path / "first.log", drive(building, seed=1, length=6.0))
+    second = write_log(tmp_path / "second.log", drive(building, seed=2, length=6.0))
+    bad = tmp_path / "bad.log"
+    bad.write_text("nonsense\n")
+    reading = ("--field-of-view", 180)
+    alone = tmp_path / "alone.apr"
+    assert run("build", first, second, "-o", alone, *reading).code == 0
+    both = tmp_path / "both.apr"
+    done = run("build", first, bad, second, "-o", both, *reading)
+    assert done.code == 1
+    assert "bad.log" in done.err
+    assert "1 of 3" in done.err
+    assert both.read_bytes() == alone.read_bytes()
+    every = tmp_path / "every"
+    done = run("build", first, bad, second, "-o", every, "--each", *reading)
+    assert done.code == 1
+    assert sorted(path.name for path in every.iterdir()) == ["first.apr", "second.apr"]
+    bad.write_text(first.read_text())
+    again = run("build", first, bad, second, "-o", every, "--each", *reading)
+    assert again.code == 0
+    assert "2 were there already" in again.err
+    assert (every / "bad.apr").read_bytes() == (every / "first.apr").read_bytes()
+
+
+def test_build_on_workers_is_the_same_to_the_last_bit(tmp_path: Path) -> None:
+    pytest.importorskip("distributed", reason="the cluster is an extra")
+    building = random_building(11, length=24.0, depth=14.0)
+    logs = [
+        write_log(tmp_path / f"{seed}.log", drive(building, seed=seed, length=6.0))
+        for seed in (1, 2, 3)
+    ]
+    words = ("--field-of-view", 180)
+    assert run("build", *logs, "-o", tmp_path / "here.apr", *words).code == 0
+    done = run("build", *logs, "-o", tmp_path / "there.apr", *words, "--workers", 2)
+    assert done.code == 0, done.err
+    assert (tmp_path / "here.apr").read_bytes() == (tmp_path / "there.apr").read_bytes()
+
+
+def test_a_cluster_that_cannot_be_had_is_one_line() -> None:
+    pytest.importorskip("distributed", reason="the cluster is an extra")
+    with pytest.raises(AnchorscanError, match="not both"), cluster("tcp://127.0.0.1:1", 2):
+        pass
+    with pytest.raises(AnchorscanError, match="no scheduler"), cluster("nonsense"):
+        pass
