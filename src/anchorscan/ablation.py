@@ -183,6 +183,18 @@ CHANGES: tuple[Change, ...] = (
         through=0.0,
     ),
     _change(
+        "extent of the view ignored",
+        "decision",
+        "The decision ignores how firmly the explained readings hold the heading.",
+        heading=0.0,
+    ),
+    _change(
+        "anchor points ignored",
+        "decision",
+        "The decision ignores how many anchor points the scan has.",
+        anchors=0.0,
+    ),
+    _change(
         "margin ignored",
         "decision",
         "The decision ignores how well the best other place fits.",
