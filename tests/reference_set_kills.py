@@ -206,7 +206,7 @@ def check_indexed(path: Path, said: list[str], before: int) -> int:
         len(places) == len(plain) >= max([before, *(int(line.split()[1]) - BATCH for line in said)])
     )
     assert [r.identifier for r in places.references] == [r.identifier for r in plain.references]
-    for number in (0, len(plain) - 1):
+    for number in {0, len(plain) - 1} if len(plain) else ():
         ours, theirs = (each.locate(scan_of(number), 3)[0] for each in (places, plain))
         assert ours.pose == theirs.pose
         assert ours.probability == theirs.probability

@@ -323,7 +323,7 @@ def test_in_a_read_only_folder_it_is_used_but_not_written(path: Path) -> None:
         assert answers(places) == answers(anew(path))
         index_path(path).chmod(0)
         assert not is_indexed(ReferenceSet.open(path))
-        with pytest.raises(ReferenceSetError, match="office.apr.index: Permission denied"):
+        with pytest.raises(ReferenceSetError, match=r"office\.apr\.index: Permission denied"):
             ReferenceSet.open(path).save_index()
     finally:
         path.parent.chmod(0o755)
@@ -332,7 +332,7 @@ def test_in_a_read_only_folder_it_is_used_but_not_written(path: Path) -> None:
 def test_a_folder_that_is_gone_is_an_error_that_names_the_index(path: Path) -> None:
     places = ReferenceSet.open(path)
     shutil.rmtree(path.parent)
-    with pytest.raises(ReferenceSetError, match="office.apr.index: No such file"):
+    with pytest.raises(ReferenceSetError, match=r"office\.apr\.index: No such file"):
         places.save_index()
 
 

@@ -31,13 +31,13 @@ from collections.abc import Iterator, Mapping, MutableMapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from hashlib import blake2b
+from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from . import __version__
 from .array_file import read_arrays, write_arrays
 from .errors import ReferenceSetError, ScanError
 from .pose import Pose2D
@@ -52,9 +52,10 @@ __all__ = ["DerivedIndex", "IndexedReferences", "index_path", "read_index", "wri
 
 # What is stored, and how; raise it when that changes.
 _FORMAT = 1
-# Whoever changes one of these derives something else from the same references.
+# Whoever changes one of these derives something else from the same references; the first names
+# the version.
 _STAGES = (
-    *("scan", "angle_function", "segments", "anchors", "graph"),
+    *("__init__", "scan", "angle_function", "segments", "anchors", "graph"),
     *("length_relation", "oriented_relation", "database"),
     *("evidence", "field", "proposal", "placed"),
 )
@@ -298,7 +299,7 @@ def _made_of(settings: Settings) -> str:
     chosen = {name: values[name] for name in _SECTIONS}
     chosen["proposal"] = {name: values["proposal"][name] for name in _PROPOSAL}
     digest = blake2b(repr((_FORMAT, chosen)).encode(), digest_size=16)
-    return f"anchorscan {__version__} {_stages()} {digest.hexdigest()}"
+    return f"{_stages()} {digest.hexdigest()}"
 
 
 @cache
@@ -308,6 +309,6 @@ def _stages() -> str:
     for stage in _STAGES:
         try:
             digest.update(Path(__file__).with_name(f"{stage}.py").read_bytes())
-        except OSError:  # installed without its source: the version has to do
-            digest.update(stage.encode())
+        except OSError:  # installed without its source: its version has to do
+            digest.update(stage.encode() + version("anchorscan").encode())
     return digest.hexdigest()

@@ -435,8 +435,8 @@ class LikelihoodField:
         directory = self._pages.copy()
         i, j = np.unique(pages, axis=0).T
         if self._table_used + len(i) > len(self._table):
-            used, directory = np.unique(np.append(directory, 0), return_inverse=True)
-            directory = directory[:-1].reshape(self._pages.shape).astype(np.int32)
+            used = np.unique(np.append(directory, 0))
+            directory = np.searchsorted(used, directory).astype(np.int32)
             self._table = _grown(self._table[used], 2 * (len(used) + len(i)))
             self._table_used, self._table_published = len(used), 1
         stale = directory[i, j] < self._table_published

@@ -100,7 +100,8 @@ class Matcher:
         self, references: Iterable[Reference] = (), settings: Settings | None = None
     ) -> None:
         self.settings = settings or Settings.preset("default")
-        singles, placed = [], []
+        singles: list[Reference] = []
+        placed: list[Reference] = []
         for reference in references:
             (placed if self._fits(reference) else singles).append(reference)
         if {each.identifier for each in placed} & {each.identifier for each in singles}:

@@ -334,7 +334,8 @@ def proposals(
         for lot in lots:
             found = _lone_proposals(query, lot, limits, out, found)
     chosen = spread(points, settings.readings)
-    return Proposals(*_checked(chosen, tiles, out, found, settings.most), found)
+    poses, scores = _checked(chosen, tiles, out, found, settings.most)
+    return Proposals(poses, scores, found)
 
 
 @kernel

@@ -266,6 +266,9 @@ class ReferenceSet:
         self._given_settings = settings
         self._file: SetFile | None = None
         self._is_closed = False
+        self._references: MutableMapping[int, Reference]
+        self._listed: tuple[Reference, ...] | None
+        self._index: DerivedIndex | None
         self._adopt(content)
 
     def _take_index(self, path: Path, settings: Settings | None) -> bool:
@@ -280,7 +283,9 @@ class ReferenceSet:
             del references[identifier]
         for reference in changes.content.references:
             references[reference.identifier] = reference
-        self._references, self._listed, self._index = references, None, index
+        self._references = references
+        self._listed = None
+        self._index = index
         return True
 
     def _adopt(self, content: SetContent) -> None:
@@ -289,11 +294,9 @@ class ReferenceSet:
         self._settings = self._given_settings
         self._build = content.build
         self._next_identifier = content.next_identifier
-        self._references: MutableMapping[int, Reference] = {
-            reference.identifier: reference for reference in content.references
-        }
-        self._index: DerivedIndex | None = None
-        self._listed: tuple[Reference, ...] | None = content.references
+        self._references = {reference.identifier: reference for reference in content.references}
+        self._index = None
+        self._listed = content.references
         self._matcher: Matcher | None = None
 
     @property
@@ -616,7 +619,8 @@ class ReferenceSet:
         if self._matcher is None:
             with self._lock:
                 if self._matcher is None:
-                    self._matcher = self._indexed() or self._derived()
+                    matcher = self._indexed()
+                    self._matcher = self._derived() if matcher is None else matcher
         return self._matcher
 
     def _derived(self) -> Matcher:
@@ -633,7 +637,10 @@ class ReferenceSet:
         try:
             matcher = Matcher.from_arrays(self._index.arrays, self.settings, self._index.read)
         except (ValueError, KeyError, IndexError):
-            return None  # it contradicts itself: then it is as good as none
+            # It contradicts itself: then it is as good as none, and its scans are no better.
+            assert self.path is not None
+            self._adopt(read_set(self.path))
+            return None
         for identifier in self._references.gone:
             matcher.remove(identifier)
         for reference in self._references.added:
