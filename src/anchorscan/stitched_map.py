@@ -194,7 +194,7 @@ class StitchedMap:
             T_reference_scan,
             settings.evaluation,
         )
-        covariances = covariance(fits, settings.decision)
+        covariances = covariance(fits[:count], settings.decision)
         return tuple(
             Hypothesis(
                 reference=each.reference.identifier,
