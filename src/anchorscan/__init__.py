@@ -21,6 +21,8 @@ if TYPE_CHECKING:  # what type checkers and editors see; a test holds it equal t
     from .io import Problem as Problem
     from .io import open_log as open_log
     from .io import write_tum as write_tum
+    from .localizer import Belief as Belief
+    from .localizer import Localizer as Localizer
     from .map_file import load_map as load_map
     from .map_file import write_map as write_map
     from .matcher import Matcher as Matcher
@@ -45,8 +47,10 @@ __version__ = "0.1.0"
 # The public names and the module that holds each: the one list behind __all__.
 _HOMES = {
     "AnchorscanError": "errors",
+    "Belief": "localizer",
     "Hypothesis": "hypothesis",
     "LaserScan": "scan",
+    "Localizer": "localizer",
     "Log": "io",
     "LogError": "errors",
     "Matcher": "matcher",
