@@ -40,6 +40,7 @@ if TYPE_CHECKING:  # what type checkers and editors see; a test holds it equal t
     from .settings import Settings as Settings
     from .simulator import drive as drive
     from .simulator import simulate as simulate
+    from .topological_localizer import TopologicalLocalizer as TopologicalLocalizer
     from .world import World as World
 
 __version__ = "0.1.0"
@@ -66,6 +67,7 @@ _HOMES = {
     "SensorModel": "sensor",
     "Settings": "settings",
     "SettingsError": "errors",
+    "TopologicalLocalizer": "topological_localizer",
     "Trace": "matcher",
     "World": "world",
     "drive": "simulator",
