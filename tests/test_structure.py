@@ -25,7 +25,7 @@ ORDER = (
     *("field", "proposal", "verification", "evaluation", "hypothesis", "decision"),
     *("motion", "belief", "settings"),
     *("description", "pairwise", "stitched_map", "matcher"),
-    *("set_file", "set_directory", "reference_set", "localizer", "topological_localizer"),
+    *("set_file", "set_directory", "reference_set", "window", "localizer", "topological_localizer"),
     *("robot", "robot_parameters", "mailbox"),
     *("explanation", "drawing", "answers"),
     *("sensor", "occupancy", "map_file", "world", "building", "simulator", "exhaustive_search"),

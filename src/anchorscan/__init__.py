@@ -41,6 +41,7 @@ if TYPE_CHECKING:  # what type checkers and editors see; a test holds it equal t
     from .simulator import drive as drive
     from .simulator import simulate as simulate
     from .topological_localizer import TopologicalLocalizer as TopologicalLocalizer
+    from .window import joined_scan as joined_scan
     from .world import World as World
 
 __version__ = "0.1.0"
@@ -71,6 +72,7 @@ _HOMES = {
     "Trace": "matcher",
     "World": "world",
     "drive": "simulator",
+    "joined_scan": "window",
     "load_map": "map_file",
     "match": "matcher",
     "open_log": "io",

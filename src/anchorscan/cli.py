@@ -342,6 +342,14 @@ def track(
             metavar="FILE", help="Write where the robot was located as a TUM trajectory, too."
         ),
     ] = None,
+    window: Annotated[
+        float,
+        typer.Option(
+            min=0.0,
+            metavar="M",
+            help="Search with the scans of the latest M metres joined into a view all around.",
+        ),
+    ] = 0.0,
     field_of_view: FieldOfViewOption = None,
     range_max: RangeMaxOption = None,
     topic: TopicOption = None,
@@ -364,7 +372,7 @@ def track(
     accepted = count = 0
     trajectory: list[tuple[float, Pose2D]] = []
     with _writing(output) as stream:
-        for line in _tracked(records, set_file, settings):
+        for line in _tracked(records, set_file, settings, window):
             stream.write(json.dumps(line, allow_nan=False) + "\n")
             stream.flush()
             count += 1
@@ -959,7 +967,7 @@ class _Locator:
 
 
 def _tracked(
-    records: Iterable[Record], set_file: Path, settings: Settings | None
+    records: Iterable[Record], set_file: Path, settings: Settings | None, window: float
 ) -> Iterator[dict[str, Any]]:
     """Yield the line of ``track`` for every record."""
     from .localizer import Localizer
@@ -967,7 +975,7 @@ def _tracked(
 
     places = ReferenceSet.open(set_file, settings=settings)
     places.prepare()
-    localizer = Localizer(places)
+    localizer = Localizer(places, window)
     for record in records:
         line: dict[str, Any] = {"scan": record.index, "stamp": record.stamp}
         if record.scan is None:

@@ -24,7 +24,7 @@ from __future__ import annotations
 import json
 import math
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -195,11 +195,12 @@ def run(
                 what = f"P5 {course.place}, {condition}: {name}"
                 made = _measured(course, condition, name, most, longest, seed, what, progress)
                 if made is not None:
+                    if not outcomes:
+                        say(_HEADER)
                     outcomes.append(made)
+                    say(_line(made))
     if not outcomes:
         raise AnchorscanError("no journey starts within a map: the drives visit no place twice")
-    for line in _table(outcomes):
-        say(line)
     if output_folder is not None:
         say(str(_kept(outcomes, Path(output_folder))))
     return tuple(outcomes)
@@ -344,20 +345,21 @@ def _fewer(one: int | None, other: int | None) -> int | None:
     return min(numbers) if numbers else None
 
 
-def _table(outcomes: Sequence[Outcome]) -> Iterator[str]:
-    yield "P5 lost robot: no prior, scans and odometry in order"
-    yield (
-        f"{'place':<18} {'odometry':<10} {'method':<10} {'starts':>6} {'found':>6} "
-        f"{'metres: median':>14} {'90 %':>6} {'ever wrong':>10} {'withdrawn':>9} {'ms a step':>9}"
+_HEADER = (
+    "P5 lost robot: no prior, scans and odometry in order\n"
+    f"{'place':<18} {'condition':<10} {'method':<10} {'starts':>6} {'found':>6} "
+    f"{'metres: median':>14} {'90 %':>6} {'ever wrong':>10} {'withdrawn':>9} {'ms a step':>9}"
+)
+
+
+def _line(one: Outcome) -> str:
+    figures = one.figures
+    withdrawn = "" if math.isnan(figures.withdrawn) else f"{figures.withdrawn:.3f}"
+    return (
+        f"{one.place:<18} {one.condition:<10} {one.follower:<10} {figures.journeys:>6} "
+        f"{figures.found:>6.3f} {figures.driven_median:>14.1f} {figures.driven_90:>6.1f} "
+        f"{figures.was_wrong:>10.3f} {withdrawn:>9} {1e3 * one.step_median:>9.2f}"
     )
-    for one in outcomes:
-        figures = one.figures
-        withdrawn = "" if math.isnan(figures.withdrawn) else f"{figures.withdrawn:.3f}"
-        yield (
-            f"{one.place:<18} {one.condition:<10} {one.follower:<10} {figures.journeys:>6} "
-            f"{figures.found:>6.3f} {figures.driven_median:>14.1f} {figures.driven_90:>6.1f} "
-            f"{figures.was_wrong:>10.3f} {withdrawn:>9} {1e3 * one.step_median:>9.2f}"
-        )
 
 
 def _kept(outcomes: Sequence[Outcome], folder: Path) -> Path:

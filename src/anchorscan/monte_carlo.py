@@ -185,8 +185,9 @@ class MonteCarlo:
 
     def _report(self) -> Belief:
         """Name the heaviest cluster: the fullest cell, and what lies around it."""
-        cells = np.floor(self._poses / (_CELL, _CELL, _CELL_TURN))
-        _, first, count = np.unique(cells, axis=0, return_index=True, return_counts=True)
+        cells = np.floor(self._poses / (_CELL, _CELL, _CELL_TURN)).astype(np.int64)
+        keys = (cells[:, 0] * 1_000_003 + cells[:, 1]) * 1_009 + cells[:, 2]
+        _, first, count = np.unique(keys, return_index=True, return_counts=True)
         centre = self._poses[first[int(np.argmax(count))]]
         off = self._poses - centre
         off[:, 2] = np.arctan2(np.sin(off[:, 2]), np.cos(off[:, 2]))
