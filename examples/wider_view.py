@@ -14,15 +14,13 @@ import argparse
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from itertools import product
 
 from anchorscan import LaserScan, Matcher, Record, Reference, joined_scan, open_log
 from anchorscan.journey import Journey, odometry
 from anchorscan.protocol import (
-    CORRECT_HEADING,
-    CORRECT_POSITION,
     Answer,
     choose_references,
-    precision_recall,
     recall_at_precision,
     revisit,
 )
@@ -31,6 +29,7 @@ View = Callable[[int], LaserScan]
 
 
 def main() -> None:
+    """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("log")
     parser.add_argument("--length", type=float, default=5.0, help="metres that are joined")
@@ -50,23 +49,23 @@ def main() -> None:
         "split   references   queries      number  top-1  accepted  of them wrong  recall at 100 %"
     )
     for split, (known, asked) in splits(records).items():
-        for references in views:
-            for queries in views:
-                answers = located(records, known, asked, views[references], views[queries])
-                right = sum(answer.is_correct for answer in answers)
-                taken = [answer for answer in answers if answer.accepted]
-                wrong = sum(not answer.is_correct for answer in taken)
-                recall, _ = recall_at_precision(
-                    [answer.probability for answer in answers],
-                    [answer.is_correct for answer in answers],
-                )
-                print(
-                    f"{split:<7} {references:<12} {queries:<12} {len(answers):>6} "
-                    f"{right:>6} {len(taken):>9} {wrong:>14} {recall:>16.2f}"
-                )
+        for (references, shown), (queries, seen) in product(views.items(), repeat=2):
+            answers = located(records, known, asked, shown, seen)
+            right = sum(answer.is_correct for answer in answers)
+            taken = [answer for answer in answers if answer.accepted]
+            wrong = sum(not answer.is_correct for answer in taken)
+            recall, _ = recall_at_precision(
+                [answer.probability for answer in answers],
+                [answer.is_correct for answer in answers],
+            )
+            print(
+                f"{split:<7} {references:<12} {queries:<12} {len(answers):>6} "
+                f"{right:>6} {len(taken):>9} {wrong:>14} {recall:>16.2f}"
+            )
 
 
 def with_odometry(records: list[Record]) -> list[Record]:
+    """Return records that all have odometry."""
     if all(record.odometry is not None for record in records):
         return records
     told = odometry(records, Journey(tuple(range(len(records)))), 0.02)
@@ -74,6 +73,7 @@ def with_odometry(records: list[Record]) -> list[Record]:
 
 
 def splits(records: Sequence[Record]) -> dict[str, tuple[tuple[int, ...], tuple[int, ...]]]:
+    """Return positions of references and queries by the name of the split."""
     half = len(records) // 2
     known = choose_references(records[:half], 1.0, math.radians(60.0))
     later = choose_references(records[half:], 0.5, math.radians(30.0))
@@ -83,6 +83,7 @@ def splits(records: Sequence[Record]) -> dict[str, tuple[tuple[int, ...], tuple[
 
 
 def is_near(records: Sequence[Record], known: Sequence[int], index: int) -> bool:
+    """Whether a reference lies within 2 m of a record."""
     pose = records[index].pose
     return any(records[k].pose.distance(pose) <= 2.0 for k in known)
 
@@ -94,6 +95,7 @@ def located(
     references: View,
     queries: View,
 ) -> list[Answer]:
+    """Locate all queries."""
     matcher = Matcher(Reference(k, references(k), records[k].pose) for k in known)
     answers = []
     for index in asked:
