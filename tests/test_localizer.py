@@ -69,7 +69,7 @@ def fed(localizer: Localizer, records: list[Record], *, wheels: bool = True) -> 
 
 
 @pytest.mark.parametrize(
-    ("wheels", "share"), [(True, 0.5), (False, 0.1)], ids=["odometry", "no odometry"]
+    ("wheels", "share"), [(True, 0.5), (False, 0.05)], ids=["odometry", "no odometry"]
 )
 def test_a_lost_robot_is_found_and_never_sure_of_a_wrong_place(
     places: Matcher, journey: list[Record], wheels: bool, share: float
