@@ -151,8 +151,8 @@ def test_results_go_to_a_file_as_they_go_to_stdout(
 def test_a_drive_is_tracked_from_nothing(
     run: Run, log: Path, places: Path, records: list[Record], tmp_path: Path
 ) -> None:
-    output = tmp_path / "track.jsonl"
-    done = run("track", places, log, "-o", output)
+    output, tum = tmp_path / "track.jsonl", tmp_path / "track.tum"
+    done = run("track", places, log, "-o", output, "--tum", tum)
     assert done.code == 0
     lines = [json.loads(line) for line in output.read_text(encoding="utf-8").splitlines()]
     assert [line["scan"] for line in lines] == [record.index for record in records]
@@ -162,6 +162,29 @@ def test_a_drive_is_tracked_from_nothing(
     assert math.hypot(last["x"] - truth.x, last["y"] - truth.y) < 0.5
     assert [len(row) for row in last["covariance"]] == [3, 3, 3]
     assert 0.9 < last["probability"] <= 1.0
+    # A line for every confident pose, and for no other: seconds, metres, a quaternion about z.
+    poses = [[float(value) for value in line.split()] for line in tum.read_text().splitlines()]
+    sure = [line for line in lines if line["accepted"]]
+    assert 0 < len(sure) == len(poses)
+    assert f"{len(sure)} poses" in done.err
+    for line, (stamp, x, y, z, qx, qy, qz, qw) in zip(sure, poses, strict=True):
+        assert stamp == pytest.approx(line["stamp"])
+        assert (x, y) == pytest.approx((line["x"], line["y"]))
+        assert (z, qx, qy) == (0.0, 0.0, 0.0)
+        assert Pose2D(0.0, 0.0, 2.0 * math.atan2(qz, qw)).turn(Pose2D(theta=line["theta"])) < 1e-6
+
+
+def test_a_window_of_scans_tracks_as_well(
+    run: Run, log: Path, places: Path, records: list[Record]
+) -> None:
+    lines = run("track", places, log, "--window", "4").lines
+    assert len(lines) == len(records)
+    assert lines[-1]["accepted"]
+    assert all(
+        Pose2D(line["x"], line["y"]).distance(Pose2D(record.pose.x, record.pose.y)) < 0.5
+        for line, record in zip(lines, records, strict=True)
+        if line["accepted"] and record.pose is not None
+    )
 
 
 def test_processes_share_the_work_and_change_nothing(log: Path, places: Path) -> None:

@@ -25,6 +25,8 @@ if TYPE_CHECKING:  # what type checkers and editors see; a test holds it equal t
     from .io import Problem as Problem
     from .io import open_log as open_log
     from .io import write_tum as write_tum
+    from .localizer import Belief as Belief
+    from .localizer import Localizer as Localizer
     from .map_file import load_map as load_map
     from .map_file import write_map as write_map
     from .matcher import Matcher as Matcher
@@ -42,6 +44,8 @@ if TYPE_CHECKING:  # what type checkers and editors see; a test holds it equal t
     from .settings import Settings as Settings
     from .simulator import drive as drive
     from .simulator import simulate as simulate
+    from .topological_localizer import TopologicalLocalizer as TopologicalLocalizer
+    from .window import joined_scan as joined_scan
     from .world import World as World
 
 __version__ = "0.1.0"
@@ -49,10 +53,12 @@ __version__ = "0.1.0"
 # The public names and the module that holds each: the one list behind __all__.
 _HOMES = {
     "AnchorscanError": "errors",
+    "Belief": "localizer",
     "BuildingHypothesis": "fleet",
     "Fleet": "fleet",
     "Hypothesis": "hypothesis",
     "LaserScan": "scan",
+    "Localizer": "localizer",
     "Log": "io",
     "LogError": "errors",
     "Matcher": "matcher",
@@ -70,9 +76,11 @@ _HOMES = {
     "ServiceError": "errors",
     "Settings": "settings",
     "SettingsError": "errors",
+    "TopologicalLocalizer": "topological_localizer",
     "Trace": "matcher",
     "World": "world",
     "drive": "simulator",
+    "joined_scan": "window",
     "load_map": "map_file",
     "match": "matcher",
     "open_log": "io",

@@ -27,7 +27,10 @@ A pose that slips off while the robot drives where little is known, or one carri
 that looks alike, has no rival yet.  So every place keeps its *record*, the mean of u over the
 latest way, and only a place is reported whose record is not bad, neither by itself nor beside
 that of another place.  For the same reason a scan holds a pose only as much as it fits there:
-its information counts with the probability that u stands for.
+its information counts with the probability that u stands for.  And walls are never quite
+straight: along a plain corridor they seem to hold the pose by a small share of what they do
+across it, and scan after scan would make certain what none of them can tell.  So that share of
+the information of the best direction is taken off in every direction.
 
 The constants are fitted on the development logs; the page on the belief says how.
 """
@@ -125,6 +128,12 @@ class BeliefSettings(BaseModel):
     mistaken: float = Field(0.1, ge=0.0, le=1.0, description="probability that it was")
     places: int = Field(32, ge=1, description="most places that are kept")
     smallest: float = Field(1e-6, ge=0.0, description="probability of a place worth keeping")
+    news: float = Field(
+        2.0, gt=0.0, description="how much sooner scans tell of the pose anew than of the place"
+    )
+    spurious: float = Field(
+        0.2, ge=0.0, le=1.0, description="share of information that walls pretend along them"
+    )
     record_way: float = Field(0.5, gt=0.0, description="way of a place's record, metres")
     least_record: float = Field(0.0, description="mean log odds of a place that is reported")
     rival_record: float = Field(
@@ -289,9 +298,10 @@ def weighed(
         weights[found] = unsearched + (1.0 - settings.support) * odds[found] - total
         nowhere = _log_sum(np.array([nowhere, unsearched - total]))
         unsearched = _NEVER
-    new = np.where(known, min(4.0 * share, 1.0), 1.0)
+    new = np.where(known, min(settings.news * share, 1.0), 1.0)
     new = new / (1.0 + np.exp(-odds))
-    information = fits.hessians * (new / settings.reading_deviation**2)[:, None, None]
+    information = _certain(fits.hessians, settings.spurious)
+    information *= (new / settings.reading_deviation**2)[:, None, None]
     covariances = _inverses(_inverses(mixture.covariances) + information)
     latest = min(share * settings.way_alike / settings.record_way, 1.0)
     record = np.where(known, mixture.record + latest * (odds - mixture.record), odds)
@@ -377,6 +387,40 @@ def _moved(poses, covariances, step, noise):  # type: ignore[no-untyped-def]
         spread[k, 1, 2] = spread[k, 2, 1] = f + s * u + c * v
         spread[k, 2, 2] = before[2, 2] + noise[2, 2]
     return out, spread
+
+
+@kernel
+def _certain(hessians, spurious):  # type: ignore[no-untyped-def]
+    """Shrink every (3, 3) information along the axes of its position part.
+
+    Along each axis what is left of the information l is l - spurious * (the larger l), at least
+    none.
+    """
+    out = np.empty(hessians.shape)
+    for k in range(len(hessians)):
+        h = hessians[k]
+        mean, half = 0.5 * (h[0, 0] + h[1, 1]), 0.5 * (h[0, 0] - h[1, 1])
+        size = math.hypot(half, h[0, 1])
+        large, small = mean + size, mean - size
+        axis = 0.5 * math.atan2(h[0, 1], half)
+        c, s = math.cos(axis), math.sin(axis)
+        first = math.sqrt(max(1.0 - spurious, 0.0))
+        second = 0.0
+        if small > spurious * large:
+            second = math.sqrt(1.0 - spurious * large / small)
+        # Shrinking from both sides keeps the matrix positive.
+        a = first * c * c + second * s * s
+        b = (first - second) * c * s
+        d = first * s * s + second * c * c
+        p, q = a * h[0, 0] + b * h[0, 1], a * h[0, 1] + b * h[1, 1]
+        r, t = b * h[0, 0] + d * h[0, 1], b * h[0, 1] + d * h[1, 1]
+        out[k, 0, 0] = p * a + q * b
+        out[k, 0, 1] = out[k, 1, 0] = p * b + q * d
+        out[k, 1, 1] = r * b + t * d
+        out[k, 0, 2] = out[k, 2, 0] = a * h[0, 2] + b * h[1, 2]
+        out[k, 1, 2] = out[k, 2, 1] = b * h[0, 2] + d * h[1, 2]
+        out[k, 2, 2] = h[2, 2]
+    return out
 
 
 @kernel

@@ -622,6 +622,20 @@ def track(
         Path | None,
         typer.Option("--output", "-o", metavar="OUT", help="File for the JSON lines, not stdout."),
     ] = None,
+    tum: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE", help="Write where the robot was located as a TUM trajectory, too."
+        ),
+    ] = None,
+    window: Annotated[
+        float,
+        typer.Option(
+            min=0.0,
+            metavar="M",
+            help="Search with the scans of the latest M metres joined into a view all around.",
+        ),
+    ] = 0.0,
     field_of_view: FieldOfViewOption = None,
     range_max: RangeMaxOption = None,
     topic: TopicOption = None,
@@ -634,19 +648,28 @@ def track(
     One JSON object a scan; "accepted" says whether the robot is located. The poses are those
     of the laser in the frame of the set, in metres and radians.
     """
+    from .io import write_tum
+
     opened = _open_log(log, _reading(field_of_view, range_max, topic, upside_down))
     settings = _read_settings(preset, settings_file)
     records: Iterable[Record] = _records(opened)
     if output is not None or not sys.stdout.isatty():
         records = _progress(records, "tracking", opened.count)
     accepted = count = 0
+    trajectory: list[tuple[float, Pose2D]] = []
     with _writing(output) as stream:
-        for line in _tracked(records, set_file, settings, opened):
+        for line in _tracked(records, set_file, settings, opened, window):
             stream.write(json.dumps(line, allow_nan=False) + "\n")
             stream.flush()
             count += 1
             accepted += line["accepted"]
+            if line["accepted"] and line["stamp"] is not None:
+                trajectory.append((line["stamp"], _pose_of(line)))
     _say(f"{log}: {count} scans: located after {accepted}, not known after {count - accepted}")
+    if tum is not None:
+        if accepted and not trajectory:
+            raise LogError("has no times, and a trajectory in TUM format needs them", log)
+        _say(f"{tum}: {write_tum(tum, trajectory)} poses")
 
 
 @app.command()
@@ -1640,7 +1663,11 @@ def _which_line(fleet: Fleet, record: Record, threads: int) -> dict[str, Any]:
 
 
 def _tracked(
-    records: Iterable[Record], set_file: Path, settings: Settings | None, log: Log
+    records: Iterable[Record],
+    set_file: Path,
+    settings: Settings | None,
+    log: Log,
+    window: float,
 ) -> Iterator[dict[str, Any]]:
     """Yield the line of ``track`` for every record."""
     from .localizer import Localizer
@@ -1649,7 +1676,7 @@ def _tracked(
     places = ReferenceSet.open(set_file, settings=settings)
     places.prepare()
     _refuse_mirrored(places, log)
-    localizer = Localizer(places)
+    localizer = Localizer(places, window)
     localizer.prepare()
     for record in records:
         line: dict[str, Any] = {"scan": record.index, "stamp": record.stamp}
@@ -1687,6 +1714,12 @@ def _pose_line(pose: Pose2D | None) -> dict[str, float | None]:
     if pose is None:  # the set has no common frame
         return {"x": None, "y": None, "theta": None}
     return {name: round(getattr(pose, name), _DECIMALS) for name in ("x", "y", "theta")}
+
+
+def _pose_of(line: dict[str, Any]) -> Pose2D:
+    from .pose import Pose2D
+
+    return Pose2D(line["x"], line["y"], line["theta"])
 
 
 def _verdict(best: Hypothesis) -> str:

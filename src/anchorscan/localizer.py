@@ -5,6 +5,9 @@ from arbitrary errors.  The localizer starts without any prior: hypotheses of th
 places of a mixture, odometry moves them, every scan weighs and refines them, and the map is
 searched again every now and then, so that a robot which was carried away is found again.
 
+A search may look with a window of the latest scans, joined by odometry into a view all around,
+which finds places that were mapped from the opposite direction; every scan is still weighed alone.
+
 Every step costs a bounded number of look-ups and at most one search; memory is bounded; nothing
 is random and nothing runs beside.
 """
@@ -12,6 +15,7 @@ is random and nothing runs beside.
 from __future__ import annotations
 
 import math
+from collections import deque
 from dataclasses import dataclass
 from typing import Literal, Protocol
 
@@ -34,16 +38,20 @@ from .hypothesis import Hypothesis
 from .matcher import _ROOM, Candidates, Matcher, Trace
 from .motion import Motion, motion
 from .pose import Pose2D
+from .record import Record
 from .reference import Reference
 from .scan import LaserScan
 from .settings import Settings
 from .verification import Fits
+from .window import joined_scan
 
 __all__ = ["Belief", "Localizer"]
 
 # How many places a belief names, and how much likelier than the next the best must be.
 _NAMED = 5
 _ALIKE = 0.3
+# So many scans of a window are kept, at equal steps.
+_KEPT = 32
 
 
 class Places(Protocol):
@@ -105,10 +113,13 @@ class Localizer:
 
     Args:
         places: A reference set or a matcher; references may come and go meanwhile.
+        window: Metres of driving whose scans are joined for a search, where odometry is known;
+            zero searches with single scans.
     """
 
-    def __init__(self, places: Places) -> None:
+    def __init__(self, places: Places, window: float = 0.0) -> None:
         self._places = places
+        self._window = window
         self._settings = places.settings.belief
         self.reset()
 
@@ -117,6 +128,7 @@ class Localizer:
         self._mixture = nothing_known()
         self._odometry: Pose2D | None = None
         self._stamp: float | None = None
+        self._recent: deque[Record] = deque(maxlen=_KEPT)
         self._since_search = math.inf
         self._belief = Belief((), 1.0, False)
 
@@ -146,6 +158,7 @@ class Localizer:
         """
         settings = self._settings
         step = self._step(odometry, stamp)
+        self._remember(scan, step)
         if not scan.is_return.any():
             self._mixture = moved(self._mixture, step, settings)
             return self._report()
@@ -177,7 +190,20 @@ class Localizer:
             self._since_search = 0.0
         return due
 
+    def _remember(self, scan: LaserScan, step: Motion) -> None:
+        """Keep the scan for the window if the robot went on a bit; what went before a gap goes."""
+        if self._window <= 0.0 or self._odometry is None:
+            return
+        if not step.measured:
+            self._recent.clear()
+        kept = self._recent[-1].odometry if self._recent else None
+        if kept is None or kept.distance(self._odometry) >= self._window / _KEPT:
+            self._recent.append(Record(0, scan, odometry=self._odometry))
+
     def _search(self, scan: LaserScan) -> NDArray[np.float64]:
+        if self._recent and self._odometry is not None:
+            latest = Record(0, scan, odometry=self._odometry)
+            scan = joined_scan([*self._recent, latest], self._window)
         in_map = self._places.explain(scan).in_map
         return np.empty((0, 3)) if in_map is None else in_map.fits.poses
 

@@ -1,0 +1,271 @@
+"""The mixture: kernels against plain twins, and what must hold for every belief."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from anchorscan import Pose2D
+from anchorscan.belief import (
+    BeliefSettings,
+    Mixture,
+    _certain,
+    _inverses,
+    _moved,
+    _new,
+    _owners,
+    admitted,
+    has_stood,
+    log_odds,
+    moved,
+    nothing_known,
+    probabilities,
+    tidied,
+    weighed,
+)
+from anchorscan.motion import motion
+from anchorscan.verification import FEATURES, Fits
+
+SETTINGS = BeliefSettings()
+seeds = st.integers(0, 2**32 - 1)
+
+
+def some_poses(rng, count, size=3.0):
+    return np.column_stack(
+        [rng.uniform(-size, size, (count, 2)), rng.uniform(-math.pi, math.pi, count)]
+    )
+
+
+def some_covariances(rng, count):
+    roots = rng.normal(0.0, 0.3, (count, 3, 3))
+    return roots @ roots.transpose(0, 2, 1) + 0.01 * np.eye(3)
+
+
+def some_mixture(rng, count):
+    """A belief in order: weights sum to one."""
+    mixture = Mixture(
+        some_poses(rng, count, 20.0),
+        some_covariances(rng, count),
+        rng.normal(-2.0, 2.0, count),
+        rng.uniform(-6.0, 4.0, count),
+        rng.uniform(-6.0, 4.0, count),
+        float(rng.normal(-2.0, 2.0)),
+        float(rng.normal(-2.0, 2.0)),
+    )
+    return tidied(mixture, SETTINGS)
+
+
+def some_fits(rng, poses, **features):
+    values = rng.uniform(0.0, 1.0, (len(poses), len(FEATURES)))
+    values[:, FEATURES.index("free")] *= 1.0 - values[:, FEATURES.index("close")]
+    for name, value in features.items():
+        values[:, FEATURES.index(name)] = value
+    hessians = some_covariances(rng, len(poses))
+    return Fits(poses, values, hessians, np.full(len(poses), 0.01), 120)
+
+
+def fit(score=0.97, close=0.99, free=0.0, unknown=0.0, through=0.0):
+    """One fit at the origin."""
+    values = {"score": score, "close": close, "free": free, "unknown": unknown, "through": through}
+    row = [values.get(name, 0.0) for name in FEATURES]
+    return Fits(np.zeros((1, 3)), np.array([row]), np.eye(3)[None], np.array([0.01]), 120)
+
+
+def total(mixture):
+    others = math.exp(mixture.unsearched) + math.exp(mixture.nowhere)
+    return float(probabilities(mixture, SETTINGS).sum()) + others
+
+
+# The twins
+
+
+@given(seed=seeds)
+def test_inverses_are_those_of_linear_algebra(seed):
+    matrices = some_covariances(np.random.default_rng(seed), 6)
+    out = _inverses(matrices)
+    assert np.allclose(out, np.linalg.inv(matrices), rtol=1e-6)
+    assert np.array_equal(out, out.transpose(0, 2, 1))
+
+
+@given(seed=seeds, spurious=st.floats(0.0, 0.5))
+def test_what_walls_pretend_along_them_is_taken_off_each_axis(seed, spurious):
+    for hessian in some_covariances(np.random.default_rng(seed), 4):
+        values, axes = np.linalg.eigh(hessian[:2, :2])
+        left = np.sqrt(np.maximum(values - spurious * values[1], 0.0) / values)
+        shrink = np.eye(3)
+        shrink[:2, :2] = axes @ np.diag(left) @ axes.T
+        out = _certain(hessian[None], spurious)[0]
+        assert np.allclose(out, shrink @ hessian @ shrink)
+
+
+@given(seed=seeds)
+def test_moving_a_place_is_composing_its_pose_and_carrying_the_covariance(seed):
+    rng = np.random.default_rng(seed)
+    poses, spread = some_poses(rng, 5), some_covariances(rng, 5)
+    step, noise = some_poses(rng, 1)[0], some_covariances(rng, 1)[0]
+    out, carried = _moved(poses, spread, step, noise)
+    for k in range(5):
+        now = Pose2D(*poses[k]) @ Pose2D(*step)
+        assert Pose2D(*out[k]).distance(now) < 1e-9
+        assert Pose2D(*out[k]).turn(now) < 1e-9
+        x, y = now.x - poses[k, 0], now.y - poses[k, 1]
+        c, s = math.cos(poses[k, 2]), math.sin(poses[k, 2])
+        of_pose = np.array([[1.0, 0.0, -y], [0.0, 1.0, x], [0.0, 0.0, 1.0]])
+        of_step = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+        wanted = of_pose @ spread[k] @ of_pose.T + of_step @ noise @ of_step.T
+        assert np.allclose(carried[k], wanted)
+
+
+def are_one(a, b, distance, turn):
+    a, b = Pose2D(*a), Pose2D(*b)
+    return a.distance(b) < distance and a.turn(b) < turn
+
+
+@given(seed=seeds)
+def test_every_place_belongs_to_the_first_owner_that_it_is_one_with(seed):
+    poses = some_poses(np.random.default_rng(seed), 12, 1.0)
+    poses[:, 2] *= 0.2
+    wanted = []
+    for k in range(12):
+        same = [j for j in range(k) if wanted[j] == j and are_one(poses[k], poses[j], 0.6, 0.4)]
+        wanted.append(same[0] if same else k)
+    assert _owners(poses, 0.6, 0.4).tolist() == wanted
+
+
+@given(seed=seeds)
+def test_new_places_are_those_that_no_known_one_is_and_come_from_the_heaviest_within_reach(seed):
+    rng = np.random.default_rng(seed)
+    known, found = some_poses(rng, 6, 1.5), some_poses(rng, 9, 1.5)
+    spread, weights = some_covariances(rng, 6), rng.normal(size=6)
+    new, parents = _new(known, spread, weights, found, (0.5, 0.5), 2.0)
+    wanted = []
+    for n, pose in enumerate(found):
+        if any(are_one(pose, each, 0.5, 0.5) for each in known):
+            continue
+        near = []
+        for k, each in enumerate(known):
+            off = pose - each
+            off[2] = math.remainder(off[2], 2.0 * math.pi)
+            if off @ np.linalg.solve(spread[k], off) < 4.0:
+                near.append(k)
+        wanted.append((n, max(near, key=lambda k: weights[k], default=-1)))
+    assert list(zip(new.tolist(), parents.tolist(), strict=True)) == wanted
+
+
+# What must hold
+
+
+def test_a_robot_just_switched_on_may_be_anywhere():
+    assert len(nothing_known()) == 0
+    assert total(nothing_known()) == pytest.approx(1.0)
+
+
+@given(seed=seeds, way=st.floats(0.0, 4.0), turn=st.floats(-3.0, 3.0))
+def test_probability_is_neither_lost_nor_made_on_the_way(seed, way, turn):
+    rng = np.random.default_rng(seed)
+    mixture = some_mixture(rng, int(rng.integers(0, 9)))
+    step = motion(Pose2D(), Pose2D(way, 0.0, turn), None, SETTINGS.motion)
+    after = moved(mixture, step, SETTINGS)
+    assert total(mixture) == pytest.approx(1.0)
+    assert total(after) == pytest.approx(1.0)
+
+
+@given(seed=seeds, share=st.floats(0.0, 1.0))
+def test_a_step_keeps_places_bounded_apart_and_summing_to_one(seed, share):
+    rng = np.random.default_rng(seed)
+    mixture = some_mixture(rng, 20)
+    mixture, origin = admitted(mixture, some_poses(rng, 30, 20.0), SETTINGS)
+    fits = some_fits(rng, mixture.poses)
+    after = tidied(weighed(mixture, fits, origin, share, SETTINGS), SETTINGS)
+    assert len(after) <= SETTINGS.places
+    assert total(after) == pytest.approx(1.0)
+    assert np.isfinite(after.covariances).all()
+    assert (np.linalg.eigvalsh(after.covariances) > 0.0).all()
+    owners = _owners(after.poses, SETTINGS.same_distance, SETTINGS.same_turn)
+    assert owners.tolist() == list(range(len(after)))
+    fields = (after.poses, after.covariances, after.weights, after.support, after.record)
+    assert {len(each) for each in fields} == {len(after)}
+
+
+@given(seed=seeds)
+def test_the_order_of_places_does_not_matter(seed):
+    rng = np.random.default_rng(seed)
+    mixture = some_mixture(rng, 8)
+    order = rng.permutation(len(mixture))
+    turned = replace(
+        mixture,
+        poses=mixture.poses[order],
+        covariances=mixture.covariances[order],
+        weights=mixture.weights[order],
+        support=mixture.support[order],
+        record=mixture.record[order],
+    )
+    one, other = tidied(mixture, SETTINGS), tidied(turned, SETTINGS)
+    assert np.allclose(one.poses, other.poses)
+    assert np.allclose(one.weights, other.weights)
+
+
+@given(low=st.floats(0.0, 0.98), more=st.floats(0.0, 0.5), through=st.floats(0.0, 1.0))
+def test_a_better_score_never_speaks_against_a_place_and_seeing_through_never_for_it(
+    low, more, through
+):
+    high = min(low + more, 1.0)
+    worse, better = (log_odds(fit(score, max(score, 0.5)), SETTINGS)[0] for score in (low, high))
+    assert better >= worse - 1e-9
+    seen = log_odds(fit(high, through=through), SETTINGS)[0]
+    assert seen <= log_odds(fit(high), SETTINGS)[0]
+
+
+def test_a_view_that_people_block_is_not_taken_against_a_place_that_explains_the_rest():
+    blocked = fit(score=0.60, close=0.66, free=0.12)
+    as_bad = fit(score=0.60, close=0.95)
+    assert log_odds(blocked, SETTINGS)[0] > 0.0
+    assert log_odds(as_bad, SETTINGS)[0] < -2.0
+
+
+def test_a_scan_of_what_nobody_mapped_says_little():
+    away = log_odds(fit(score=0.0, close=0.0, unknown=1.0), SETTINGS)[0]
+    missed = log_odds(fit(score=0.4, close=0.9), SETTINGS)[0]
+    assert abs(away) < 1.5
+    assert missed < -3.0
+
+
+def test_standing_still_proves_nothing():
+    rng = np.random.default_rng(0)
+    mixture, origin = admitted(nothing_known(), np.array([[0.0, 0, 0], [9.0, 0, 0]]), SETTINGS)
+    fits = some_fits(rng, mixture.poses, score=[0.95, 0.9], close=1.0, unknown=0.0, through=0.0)
+    mixture = tidied(weighed(mixture, fits, origin, SETTINGS.still, SETTINGS), SETTINGS)
+    first = probabilities(mixture, SETTINGS)
+    for _ in range(5):
+        mixture = weighed(mixture, fits, np.arange(2), 0.0, SETTINGS)
+    assert np.allclose(probabilities(tidied(mixture, SETTINGS), SETTINGS), first)
+
+
+def test_a_scan_that_fits_badly_holds_the_pose_less():
+    rng = np.random.default_rng(0)
+    mixture, _ = admitted(nothing_known(), np.zeros((1, 3)), SETTINGS)
+    spreads = []
+    for score in (0.97, 0.3):
+        fits = some_fits(rng, mixture.poses, score=score, close=1.0, unknown=0.0, through=0.0)
+        fits = replace(fits, hessians=30.0 * np.eye(3)[None])
+        after = weighed(mixture, fits, np.arange(1), 0.2, SETTINGS)
+        spreads.append(np.trace(after.covariances[0]))
+    assert spreads[0] < 0.5 * spreads[1]
+
+
+def test_a_place_that_lately_fits_badly_or_much_worse_than_another_has_not_stood():
+    def records(*values):
+        count = len(values)
+        covariances = np.repeat(np.eye(3)[None], count, axis=0)
+        zeros = np.zeros(count)
+        return Mixture(np.zeros((count, 3)), covariances, zeros, zeros, np.array(values))
+
+    assert has_stood(records(3.0), 0, SETTINGS)
+    assert not has_stood(records(-1.0), 0, SETTINGS)
+    assert has_stood(records(2.0, 4.0), 0, SETTINGS)
+    assert not has_stood(records(0.2, 4.0), 0, SETTINGS)

@@ -1,0 +1,245 @@
+"""The localizer over time: found from nothing, sure only where it may be, and found again."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from anchorscan import (
+    LaserScan,
+    Localizer,
+    Matcher,
+    Pose2D,
+    Record,
+    Reference,
+    drive,
+    random_building,
+)
+from anchorscan.localizer import Belief
+from anchorscan.protocol import CORRECT_HEADING, CORRECT_POSITION, choose_references
+
+BLIND = LaserScan(np.full(181, np.inf), -math.pi / 2, math.pi / 180)
+
+
+def known(records: list[Record]) -> Matcher:
+    chosen = [records[position] for position in choose_references(records)]
+    return Matcher(Reference(r.index, r.scan, r.pose) for r in chosen if r.scan is not None)
+
+
+def is_right(belief: Belief, record: Record) -> bool:
+    assert belief.pose is not None
+    assert record.pose is not None
+    return (
+        belief.pose.distance(record.pose) <= CORRECT_POSITION
+        and belief.pose.turn(record.pose) <= CORRECT_HEADING
+    )
+
+
+def told(belief: Belief) -> tuple[object, ...]:
+    """All that a belief says, to be compared exactly."""
+    places = [
+        (h.reference, h.pose, h.covariance.tobytes(), h.score, h.probability, h.accepted)
+        for h in belief.hypotheses
+    ]
+    return (*places, belief.elsewhere, belief.accepted, belief.state)
+
+
+@pytest.fixture(scope="module")
+def places() -> Matcher:
+    return known(drive(random_building(5), seed=1, length=120.0))
+
+
+@pytest.fixture(scope="module")
+def journey() -> list[Record]:
+    """An independent drive through the same building, with noisy odometry."""
+    return drive(random_building(5), seed=2, length=25.0, odometry_noise=0.05)
+
+
+def fed(localizer: Localizer, records: list[Record], *, wheels: bool = True) -> list[Belief]:
+    assert all(record.scan is not None for record in records)
+    return [
+        localizer.update(r.scan, r.odometry if wheels else None, r.stamp)  # type: ignore[arg-type]
+        for r in records
+    ]
+
+
+@pytest.mark.parametrize(
+    ("wheels", "share"), [(True, 0.5), (False, 0.05)], ids=["odometry", "no odometry"]
+)
+def test_a_lost_robot_is_found_and_never_sure_of_a_wrong_place(
+    places: Matcher, journey: list[Record], wheels: bool, share: float
+) -> None:
+    beliefs = fed(Localizer(places), journey, wheels=wheels)
+    sure = [is_right(b, r) for b, r in zip(beliefs, journey, strict=True) if b.accepted]
+    assert len(sure) >= share * len(journey)
+    assert all(sure)
+
+
+def test_the_same_scans_give_the_same_beliefs_to_the_last_bit(
+    places: Matcher, journey: list[Record]
+) -> None:
+    localizer = Localizer(places)
+    first = [told(belief) for belief in fed(localizer, journey[:25])]
+    localizer.reset()
+    assert [told(belief) for belief in fed(localizer, journey[:25])] == first
+
+
+def test_where_odometry_began_does_not_matter(places: Matcher, journey: list[Record]) -> None:
+    frame = Pose2D(30.0, -4.0, 2.0)
+    one, other = Localizer(places), Localizer(places)
+    for record in journey[:25]:
+        assert record.scan is not None
+        assert record.odometry is not None
+        here = one.update(record.scan, record.odometry)
+        there = other.update(record.scan, frame @ record.odometry)
+        assert here.accepted == there.accepted
+        if here.pose is not None and there.pose is not None and here.probability > 0.9:
+            assert here.pose.distance(there.pose) < 1e-3
+
+
+def test_a_robot_that_was_carried_away_is_doubted_and_found_again(
+    places: Matcher, journey: list[Record]
+) -> None:
+    half = len(journey) // 2
+    here = journey[half - 1].pose
+    assert here is not None
+    apart = [r.pose is not None and r.pose.distance(here) > 5.0 for r in journey]
+    there = next(i for i in range(len(journey)) if apart[i])
+    localizer = Localizer(places)
+    assert any(belief.accepted for belief in fed(localizer, journey[:half]))
+    # The wheels stood still while it was carried: their pose goes on from where it was.
+    T_odom_odom = journey[half - 1].odometry @ journey[there].odometry.inverse()  # type: ignore[union-attr, operator]
+    driven, sure = 0.0, []
+    for before, record in zip([journey[there], *journey[there:]], journey[there:], strict=False):
+        driven += before.pose.distance(record.pose)  # type: ignore[union-attr, arg-type]
+        belief = localizer.update(record.scan, T_odom_odom @ record.odometry, None)  # type: ignore[arg-type, operator]
+        sure.append((driven, belief.accepted, is_right(belief, record)))
+    assert not any(accepted and not right for metres, accepted, right in sure if metres > 2.0)
+    assert any(accepted and right for _, accepted, right in sure)
+
+
+def test_a_robot_outside_of_the_map_is_never_sure(places: Matcher) -> None:
+    elsewhere = drive(random_building(8), seed=3, length=15.0)
+    assert not any(belief.accepted for belief in fed(Localizer(places), elsewhere))
+
+
+def test_a_blind_scan_gives_no_new_evidence_and_no_search(
+    places: Matcher, journey: list[Record]
+) -> None:
+    localizer = Localizer(places)
+    assert localizer.update(BLIND).hypotheses == ()
+    assert localizer.update(BLIND).state == "lost"
+    before = fed(localizer, journey[:20])[-1]
+    after = localizer.update(BLIND, journey[19].odometry, journey[19].stamp)
+    assert len(after.hypotheses) == len(before.hypotheses)
+    assert after.probability <= before.probability
+
+
+def test_an_empty_map_knows_nothing(journey: list[Record]) -> None:
+    beliefs = fed(Localizer(Matcher()), journey[:3])
+    assert {(b.pose, b.accepted, b.elsewhere) for b in beliefs} == {(None, False, 1.0)}
+
+
+@settings(max_examples=12)
+@given(data=st.data())
+def test_no_odometry_clock_or_scan_breaks_the_belief(
+    places: Matcher, journey: list[Record], data: st.DataObject
+) -> None:
+    localizer = Localizer(places)
+    numbers = st.one_of(st.none(), st.floats(), st.floats(-5.0, 5.0))
+    for _ in range(6):
+        record = data.draw(st.sampled_from(journey))
+        scan = data.draw(st.sampled_from([record.scan, BLIND]))
+        x = data.draw(numbers)
+        wheels = None if x is None else Pose2D(x, 0.0, data.draw(st.floats(-4.0, 4.0)))
+        belief = localizer.update(scan, wheels, data.draw(numbers))  # type: ignore[arg-type]
+        named = sum(each.probability for each in belief.hypotheses)
+        assert 0.0 <= belief.probability <= 1.0
+        assert named + belief.elsewhere <= 1.0 + 1e-9
+        assert [h.probability for h in belief.hypotheses] == sorted(
+            (h.probability for h in belief.hypotheses), reverse=True
+        ) or not belief.accepted
+        assert all(h.pose is not None and h.pose.is_finite() for h in belief.hypotheses)
+
+
+class Counting:
+    """A map that counts what it is asked."""
+
+    def __init__(self, places: Matcher) -> None:
+        self.places = places
+        self.settings = places.settings
+        self.nearest = places.nearest
+        self.searches = 0
+        self.most = 0
+
+    def explain(self, scan: LaserScan, candidates: None = None):  # type: ignore[no-untyped-def]
+        self.searches += 1
+        return self.places.explain(scan, candidates)
+
+    def follow(self, scan, poses, stiffness):  # type: ignore[no-untyped-def]
+        self.most = max(self.most, len(poses))
+        return self.places.follow(scan, poses, stiffness)
+
+
+def test_a_step_costs_at_most_one_search_and_a_bounded_number_of_places(
+    places: Matcher, journey: list[Record]
+) -> None:
+    counting = Counting(places)
+    localizer = Localizer(counting)
+    limits = places.settings
+    for number, record in enumerate(journey, start=1):
+        belief = fed(localizer, [record])[0]
+        assert counting.searches <= number
+        assert len(localizer.mixture) <= limits.belief.places
+        assert len(belief.hypotheses) <= 5
+    assert counting.most <= limits.belief.places + limits.verification.fits
+    assert counting.searches < len(journey)
+
+
+# On real logs
+
+
+def blocked(scan: LaserScan, rng: np.random.Generator, share: float = 0.3) -> LaserScan:
+    """Some readings end nearer: legs and bodies, two to eight readings wide."""
+    ranges = scan.ranges.astype(np.float64).copy()
+    hidden = np.zeros(len(ranges), bool)
+    while hidden.mean() < share:
+        begin, width = int(rng.integers(len(ranges))), int(rng.integers(2, 9))
+        near = np.where(np.isfinite(ranges[begin : begin + width]), 1.0, 0.0)
+        farthest = np.minimum(np.nan_to_num(ranges[begin : begin + width], posinf=8.0), 8.0)
+        body = rng.uniform(0.3, 0.9) * float(farthest.min(initial=8.0))
+        ranges[begin : begin + width] = np.where(near > 0, body, ranges[begin : begin + width])
+        hidden[begin : begin + width] = True
+    return LaserScan(ranges, scan.angle_min, scan.angle_increment, scan.range_min, scan.range_max)
+
+
+def test_people_around_the_robot_neither_break_nor_mislead_the_belief(
+    real_records: Callable[[str], list[Record]],
+) -> None:
+    places = known(real_records("wean-2.log.gz"))
+    records = real_records("wean-3.log.gz")[:600:2]
+    localizer, rng = Localizer(places), np.random.default_rng(0)
+    sure = []
+    for record in records:
+        assert record.scan is not None
+        belief = localizer.update(blocked(record.scan, rng), record.odometry, record.stamp)
+        if belief.accepted:
+            sure.append(is_right(belief, record))
+    assert len(sure) > 0.3 * len(records)
+    assert all(sure)
+
+
+def test_a_real_drive_is_followed_with_its_raw_odometry(
+    real_records: Callable[[str], list[Record]],
+) -> None:
+    records = real_records("wean-3.log.gz")[300:900]
+    places = known(real_records("wean-2.log.gz"))
+    beliefs = fed(Localizer(places), records)
+    sure = [is_right(b, r) for b, r in zip(beliefs, records, strict=True) if b.accepted]
+    assert len(sure) > 0.8 * len(records)
+    assert all(sure)
