@@ -9,6 +9,7 @@ import sys
 import threading
 import time
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -316,10 +317,33 @@ def test_the_file_on_the_page_about_robots_is_understood() -> None:
     RobotParameters(**given)
 
 
+def test_a_scan_waits_for_odometry_that_is_on_its_way_and_for_no_other() -> None:
+    def waited(odometry: Odometry, stamp: float, seconds: float) -> bool:
+        """Whether it was waited for something, found out without a clock."""
+        with mock.patch.object(odometry._lock, "wait_for") as wait_for:
+            odometry.wait_until(stamp, seconds)
+        return bool(wait_for.called)
+
+    odometry = Odometry()
+    assert not waited(odometry, 5.0, 60.0), "there is none"
+    odometry.add(5.0, Pose2D())
+    assert not waited(odometry, 5.0, 60.0), "it is there"
+    assert not waited(odometry, 4.0, 60.0)
+    assert not waited(odometry, 7.0, 60.0), "it has stopped"
+    assert waited(odometry, 5.5, 60.0)
+    odometry.wait_until(5.5, 0.01)  # no longer than that
+    later = threading.Timer(0.05, odometry.add, (5.6, Pose2D(1.0, 0.0, 0.0)))
+    later.start()
+    odometry.wait_until(5.5, 60.0)
+    assert odometry.at(5.6) == Pose2D(1.0, 0.0, 0.0)
+    later.join()
+
+
 def test_what_is_prepared_compiles_nothing_with_its_first_scans() -> None:
     """In a process of its own: here other tests have compiled everything."""
     code = """
 import sys
+import anchorscan
 from numba.core.dispatcher import Dispatcher
 from anchorscan import Matcher, Reference, drive, random_building
 from anchorscan.localizer import Localizer
@@ -335,6 +359,8 @@ places.prepare()
 localizer = Localizer(places)
 localizer.prepare()
 before = compiled()
+derive = anchorscan.stitched_map.landmarks
+anchorscan.stitched_map.landmarks = None  # derived already, or this would be called
 for record in records:
     localizer.update(record.scan, record.odometry, record.stamp)
 assert len(localizer.mixture)

@@ -59,6 +59,8 @@ __all__ = [
 Bounds = tuple[float, float, float, float]
 
 _DPI = 130
+# Of the picture, what the number of an anchor point takes.
+_NUMBER_SIZE = 0.04
 _MOST_NUMBERS = 30
 _MOST_IN_A_ROW = 6
 # Nearer to a surface than this, metres, the map is shaded.
@@ -334,10 +336,15 @@ def plot_anchors(
 
 
 def number_anchors(axes: Axes, anchors: AnchorPoints, theme: Theme) -> None:
-    """Number anchor points, where there are not too many."""
+    """Number anchor points, where there are not too many and no number stands already."""
     if len(anchors) > _MOST_NUMBERS:
         return
+    apart = _NUMBER_SIZE * max(np.ptp(axes.get_xlim()), np.ptp(axes.get_ylim()))
+    numbered: list[tuple[float, float]] = []
     for n, (x, y) in enumerate(anchors.positions.tolist()):
+        if any(abs(x - u) < apart and abs(y - v) < 0.8 * apart for u, v in numbered):
+            continue
+        numbered.append((x, y))
         axes.annotate(
             str(n),
             (x, y),

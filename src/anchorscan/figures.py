@@ -337,7 +337,8 @@ def _plot_best_votes(axes: Axes, explanation: Explanation, theme: Theme) -> None
         theme,
     )
     axes.margins(x=0.22)
-    axes.set_xlabel("q")
+    is_weighed = bool((votes.counts[rows] % 1.0).any())
+    axes.set_xlabel(f"q (n: votes{', rare ones count more' if is_weighed else ''})")
     place = f"rank {rank[0] + 1} of {len(votes)}" if len(rank) else "no vote"
     axes.set_title(f"the answer's reference has {place}")
 
@@ -357,8 +358,9 @@ def _draw_graphs(explanation: Explanation, theme: Theme) -> Figure:
     name = f"reference {pairing.reference.identifier}"
     _plot_graph(left, theirs, pairing.edges[:, 0], name, theme.reference, theme)
     _plot_graph(right, ours, pairing.edges[:, 1], "scan", theme.scan, theme)
-    for axes in (left, right):
+    for axes, anchors in ((left, theirs.anchors), (right, ours.anchors)):
         view(axes, bounds)
+        number_anchors(axes, anchors, theme)
         ruler(axes, theme)
     _connect(figure, left, right, pairing, ours.anchors, theme)
     legend(
@@ -386,7 +388,6 @@ def _plot_graph(
     plot_edges(axes, known.graph, np.arange(len(known.graph)), theme.faint, 0.6)
     plot_edges(axes, known.graph, shared, theme.ink, 1.5)
     plot_anchors(axes, known.anchors, theme)
-    number_anchors(axes, known.anchors, theme)
     axes.set_title(
         f"{name}: {len(known.anchors)} anchor points, {len(known.graph)} edges, "
         f"{len(shared)} shared"
@@ -477,7 +478,10 @@ def _draw_matrix(explanation: Explanation, theme: Theme) -> Figure:
     _whole_numbers(axes, x=True)
     axes.set_xlabel("anchor point of the scan")
     axes.set_ylabel(f"anchor point of reference {pairing.reference.identifier}")
-    axes.set_title("how many pairs of edges would lay one on the other")
+    is_tall = matrix.shape[0] > 1.5 * matrix.shape[1]
+    axes.set_title(
+        "how many pairs of edges would lay one on the other", loc="right" if is_tall else "left"
+    )
     legend(
         figure,
         [

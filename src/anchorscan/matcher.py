@@ -233,12 +233,13 @@ class Matcher:
             (self._map if identifier in self._map else self._singles).remove(identifier)
 
     def prepare(self) -> None:
-        """Compile everything, so that the first real scan does not pay for it."""
+        """Compile and derive everything, so that the first real scan does not pay for it."""
         places = Matcher((Reference(0, _ROOM, Pose2D()),), self.settings)
         places.add(Reference(1, _ROOM))
         for candidates in (1, "all"):
             for hypothesis in (trace := places.explain(_ROOM, candidates)).hypotheses[:1]:
                 trace.evaluation(hypothesis)
+        self.explain(_ROOM)  # what is derived from these references when they are first searched
 
     def _know(self, reference: Reference) -> Known:
         return Known(reference, describe(reference.scan, self.settings))

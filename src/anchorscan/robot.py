@@ -40,6 +40,8 @@ _CLOCK_JUMP = 1.0
 # Odometry is kept for this long, and held to be true for so long before and after, seconds.
 _MEMORY = 10.0
 _REACH = 0.25
+# Odometry this much older than a scan has stopped, seconds.
+_LATE = 1.0
 # Farther than this and faster than this no robot drives between two messages, metres, and a
 # second.
 _JUMP, _SPEED = 0.5, 5.0
@@ -105,7 +107,7 @@ class Odometry:
 
     def __init__(self) -> None:
         self._samples: deque[tuple[float, Pose2D]] = deque()
-        self._lock = threading.Lock()
+        self._lock = threading.Condition()
         self.breaks = 0
 
     def add(self, stamp: float, T_odom_base: Pose2D) -> None:
@@ -125,6 +127,19 @@ class Odometry:
             self._samples.append((stamp, T_odom_base))
             while self._samples[0][0] < stamp - _MEMORY:
                 self._samples.popleft()
+            self._lock.notify_all()
+
+    def wait_until(self, stamp: float, seconds: float) -> None:
+        """Wait until odometry has come as far as a time, but no longer than so many seconds.
+
+        What was measured before a scan may be delivered after it.  Odometry that has never
+        come, or has stopped, is not waited for.
+        """
+        with self._lock:
+            if self._samples and 0.0 < stamp - self._samples[-1][0] < _LATE:
+                self._lock.wait_for(
+                    lambda: not self._samples or self._samples[-1][0] >= stamp, seconds
+                )
 
     def at(self, stamp: float) -> Pose2D | None:
         """Return the pose of the base at a time, None where no message near it tells."""

@@ -77,6 +77,8 @@ __all__ = ["LocalizationNode", "main"]
 # A laser that tilts more than this does not see the walls of a plan, radians.
 _LEVEL = math.radians(10.0)
 _ODOMETRY_DEPTH = 100
+# So long a scan waits for odometry that is on its way, seconds.
+_PATIENCE = 0.1
 _NANO = 1e-9
 _NAMED_HYPOTHESES = 3
 
@@ -244,11 +246,12 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
         self._pose = publisher(PoseWithCovarianceStamped, "~/pose", 1)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 1)
         self._subscriptions_here = [
-            self.create_subscription(
-                LaserScanMessage, options.scan_topic, self._take_scan, best_effort
-            ),
+            # First odometry: of messages that wait, those of the first subscription come first.
             self.create_subscription(
                 OdometryMessage, options.odom_topic, self._take_odometry, many
+            ),
+            self.create_subscription(
+                LaserScanMessage, options.scan_topic, self._take_scan, best_effort
             ),
         ]
         if not options.set_file:
@@ -438,6 +441,8 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
             self._complain("scan", f"is unusable: {error}")
             return
         self._mend("scan")
+        if (waiting := self._robot) is not None:
+            waiting.odometry.wait_until(self._stamp(message), _PATIENCE)
         begin = time.perf_counter()
         with self._lock:
             robot = self._robot

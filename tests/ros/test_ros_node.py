@@ -175,6 +175,23 @@ def awake(observer: Observer) -> None:
     assert observer.change("activate")
 
 
+def play_until_told(
+    observer: Observer,
+    robot: Process,
+    recording: Recording,
+    count: int,
+    *,
+    first: int = 0,
+    **options: Any,
+) -> None:
+    """Play on until so many poses were told: a busy machine loses most of the scans."""
+    for begin in range(first, len(recording.stamps), 10):
+        robot.tell(do="play", file=recording.path, first=begin, last=begin + 10, **options)
+        if len(observer.heard["initialpose"]) >= count:
+            return
+    observer.wait(lambda: len(observer.heard["initialpose"]) >= count, f"no pose {count}")
+
+
 def test_a_lifecycle_from_birth_to_death(observer: Observer, start: Start) -> None:
     process = start(laser_pose=LASER_POSE)
     assert observer.state() == "unconfigured"
@@ -223,9 +240,9 @@ def test_a_robot_finds_itself_when_the_map_comes_late(
     assert observer.trigger("locate") == (False, "there is no map yet")
     assert robot.tell(do="map", file=map_file) == 1
     observer.wait(lambda: observer.values()["references"] != "0", "no references")
-    robot.tell(do="play", file=recording.path, first=10, last=40)
+    play_until_told(observer, robot, recording, 1, first=10)
 
-    told = observer.wait(lambda: observer.heard["initialpose"], "no pose")[0]
+    told = observer.heard["initialpose"][0]
     assert told.header.frame_id == "map"
     assert recording.is_right(told)
     covariance = np.reshape(told.pose.covariance, (6, 6))
@@ -242,15 +259,14 @@ def test_a_robot_finds_itself_when_the_map_comes_late(
 
     # Once is once, until somebody asks.
     observer.says("located and told")
-    robot.tell(do="play", file=recording.path, first=40, last=60)
+    robot.tell(do="play", file=recording.path, first=70, last=90)
     assert len(observer.heard["initialpose"]) == 1
     success, words = observer.trigger("locate")
     assert success
     assert "located at" in words
     observer.wait(lambda: len(observer.heard["initialpose"]) == 2, "no second pose")
     assert observer.trigger("start_over")[0]
-    robot.tell(do="play", file=recording.path, first=60, last=90)
-    observer.wait(lambda: len(observer.heard["initialpose"]) == 3, "no third pose")
+    play_until_told(observer, robot, recording, 3, first=90)
     assert all(recording.is_right(message) for message in observer.heard["initialpose"])
 
 
@@ -267,8 +283,7 @@ def test_nothing_is_told_before_anybody_listens(
     assert observer.values()["told"] == "False"
     observer.listen()
     time.sleep(1.0)
-    robot.tell(do="play", file=recording.path, first=20, last=40)
-    observer.wait(lambda: observer.heard["initialpose"], "no pose")
+    play_until_told(observer, robot, recording, 1, first=20)
     assert recording.is_right(observer.heard["initialpose"][0])
 
 
@@ -332,8 +347,7 @@ def test_garbage_is_counted_named_and_survived(
     # These two are scans, if strange ones.
     assert set(GARBAGE) - refused <= {"one reading", "a million readings"}
     assert observer.heard["initialpose"] == []
-    robot.tell(do="play", file=recording.path, first=0, last=30)
-    observer.wait(lambda: observer.heard["initialpose"], "no pose after garbage")
+    play_until_told(observer, robot, recording, 1)
     assert recording.is_right(observer.heard["initialpose"][0])
 
 
@@ -350,14 +364,12 @@ def test_another_sensor_and_a_clock_that_goes_back(
     robot.tell(do="map", file=map_file)
     awake(observer)
     observer.wait(lambda: observer.values().get("references", "0") != "0", "no references")
-    robot.tell(do="play", file=recording.path, last=30)
-    observer.wait(lambda: len(observer.heard["initialpose"]) == 1, "no pose")
+    play_until_told(observer, robot, recording, 1)
     # A robot that is killed, and another that begins again, earlier and with another sensor.
     robot.kill()
     robot = start(player)
     robot.tell(do="map", file=map_file)
-    robot.tell(do="play", file=other_recording.path, last=40, offset=-5_000.0)
-    observer.wait(lambda: len(observer.heard["initialpose"]) == 2, "no pose after the jump")
+    play_until_told(observer, robot, other_recording, 2, offset=-5_000.0)
     first, second = observer.heard["initialpose"]
     assert recording.is_right(first)
     assert other_recording.is_right(second, offset=-5_000.0)
@@ -371,8 +383,7 @@ def test_a_killed_node_comes_back_and_finds_the_map(
     observer.listen()
     robot.tell(do="map", file=map_file)
     awake(observer)
-    robot.tell(do="play", file=recording.path, last=40)
-    observer.wait(lambda: len(observer.heard["initialpose"]) == 1, "no pose")
+    play_until_told(observer, robot, recording, 1)
     process.kill()
     observer.heard["diagnostics"].clear()
     # Started as a user does, it needs nobody to wake it.
@@ -380,8 +391,7 @@ def test_a_killed_node_comes_back_and_finds_the_map(
     observer.says("no scan")
     assert observer.state() == "active"
     observer.wait(lambda: observer.values().get("references", "0") != "0", "no references")
-    robot.tell(do="play", file=recording.path, first=40, last=80)
-    observer.wait(lambda: len(observer.heard["initialpose"]) == 2, "no pose after the kill")
+    play_until_told(observer, robot, recording, 2, first=40)
     assert all(recording.is_right(message) for message in observer.heard["initialpose"])
     assert process.end() == 0
 
@@ -402,8 +412,7 @@ def test_a_new_map_is_used_and_the_same_one_is_not_made_twice(
     robot.tell(do="map", file=map_file)
     observer.wait(lambda: observer.values()["references"] != before, "the old map is used")
     robot.tell(do="map", file=map_file)
-    robot.tell(do="play", file=recording.path, first=15, last=40)
-    observer.wait(lambda: observer.heard["initialpose"], "no pose in the new map")
+    play_until_told(observer, robot, recording, 1, first=15)
     assert recording.is_right(observer.heard["initialpose"][0])
     assert process.log.read_text(encoding="utf-8").count("locating in a map") == 2
 
@@ -454,8 +463,7 @@ def test_a_set_file_takes_the_place_of_a_map(
     observer.set_parameter("scan_topic", "scan")
     awake(observer)
     robot = start(player)
-    robot.tell(do="play", file=recording.path, first=5, last=40)
-    observer.wait(lambda: observer.heard["initialpose"], "no pose")
+    play_until_told(observer, robot, recording, 1, first=5)
     assert recording.is_right(observer.heard["initialpose"][0])
 
 
@@ -532,7 +540,7 @@ def test_a_turtlebot_finds_itself_on_a_college_floor(
     awake(observer)
     observer.wait(lambda: observer.values().get("references", "0") != "0", "no references")
     robot.tell(do="play", file=recording.path, rate=25.0)
-    hypotheses = observer.heard["hypotheses"]
+    hypotheses = list(observer.heard["hypotheses"])
     assert len(hypotheses) >= 100
     from anchorscan.map_check import rigid_track
 

@@ -126,7 +126,8 @@ class Observer:
         end = time.monotonic() + seconds
         while not (value := what()):
             if time.monotonic() > end:
-                raise AssertionError(f"{reason} in {seconds} s; diagnostics: {self.summary()}")
+                told = f"{self.summary()}; {self.values()}"
+                raise AssertionError(f"{reason} in {seconds} s; diagnostics: {told}")
             time.sleep(0.02)
         return value
 
