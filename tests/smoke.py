@@ -17,7 +17,7 @@ def main() -> None:
     """Run the smoke test."""
     assert "site-packages" in anchorscan.__file__, "this is not the installed package"
     world = anchorscan.random_building(3)
-    records = list(anchorscan.drive(world, np.random.default_rng(3)))[:120]
+    records = list(anchorscan.drive(world, seed=3))[:120]
     with tempfile.TemporaryDirectory() as folder:
         path, log = Path(folder) / "a.apr", Path(folder) / "log.npz"
         with anchorscan.ReferenceSet.build(records, path=path) as places:

@@ -1,4 +1,4 @@
-"""Damage at random, the same every time: no target may fall, hang, or take memory that it is not due.
+"""Damage at random, the same every time: no target may fall, hang, or hoard memory.
 
 The long search is a command, ``make fuzz``; what it found stands in ``test_bad_input.py``.
 """
