@@ -5,12 +5,16 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 PYTEST_ARGS ?=
+FUZZ_TARGETS ?=
+FUZZ_RUNS ?= 1000000
+FUZZ_SECONDS ?= 3600
 
 .DEFAULT_GOAL := help
 .PHONY: help setup check test ros-test bench docs release demo picture lock clean
+.PHONY: fuzz test-lowest test-newest audit package
 
 help: ## show this list
-	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-9s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-11s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
 
 setup: $(VENV)/.ready ## make .venv with the package (editable) and the pinned tools
 
@@ -46,6 +50,40 @@ $(VENV)-ros/.ready: requirements-ros.txt pyproject.toml
 		--no-build-isolation -e .
 	@touch $@
 
+fuzz: setup ## damage everything that is read: FUZZ_TARGETS, FUZZ_RUNS and FUZZ_SECONDS a target
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --only-binary :all: atheris || \
+		echo "note: no atheris for this Python; inputs are damaged without its guidance"
+	cd tests && ../$(BIN)/python -m fuzz $(FUZZ_TARGETS) --runs $(FUZZ_RUNS) \
+		--seconds $(FUZZ_SECONDS) --findings ../fuzz-findings
+
+test-lowest: setup ## every test with the oldest versions that pyproject.toml allows
+	$(call test_with,lowest-direct,$(VENV)-lowest)
+
+test-newest: setup ## every test with the newest versions that there are, not the pinned ones
+	$(call test_with,highest,$(VENV)-newest)
+
+define test_with
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check uv
+	$(PYTHON) -m venv --clear --without-pip $(2)
+	$(BIN)/uv pip install --quiet --python $(2)/bin/python --resolution $(1) \
+		-e ".[bags,maps,plot]" "rtb-data>=1.0" "pytest>=8" "hypothesis>=6.100"
+	$(2)/bin/python -m pytest $(PYTEST_ARGS)
+endef
+
+audit: setup ## look the pinned versions up among the known weaknesses; needs pypi.org
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check pip-audit
+	$(BIN)/pip-audit --strict --disable-pip --require-hashes -r requirements-dev.txt
+
+package: setup ## build both distributions and try the wheel in an empty environment
+	rm -rf dist $(VENV)-package
+	$(BIN)/python -m build --no-isolation --quiet
+	$(PYTHON) -m venv $(VENV)-package 2>/dev/null || { \
+		$(PYTHON) -m venv --clear --without-pip $(VENV)-package && \
+		$(PYTHON) -m pip --python $(VENV)-package/bin/python install --quiet pip; }
+	$(VENV)-package/bin/python -m pip install --quiet --disable-pip-version-check dist/*.whl
+	cd dist && ../$(VENV)-package/bin/anchorscan --version && \
+		../$(VENV)-package/bin/python ../tests/smoke.py
+
 bench: setup ## the protocols on the logs in ANCHORSCAN_DATA
 	$(BIN)/anchorscan bench
 
@@ -79,4 +117,4 @@ lock: setup ## resolve the pinned requirements anew, for Python 3.10 and later
 		pyproject.toml requirements-ros.in --output-file requirements-ros.txt
 
 clean: ## remove what the verbs made
-	rm -rf $(VENV) $(VENV)-release $(VENV)-ros site dist build .mypy_cache .ruff_cache .pytest_cache
+	rm -rf $(VENV) $(VENV)-release $(VENV)-ros $(VENV)-lowest $(VENV)-newest $(VENV)-package site dist build .mypy_cache .ruff_cache .pytest_cache

@@ -100,7 +100,7 @@ def angle_function(scan: LaserScan, settings: AngleFunctionSettings) -> AngleFun
     """
     step = abs(scan.angle_increment)
     points, ranges, beams, indices, count = _returns(
-        scan.ranges, scan.angle_min, scan.angle_increment, scan.range_min, scan.range_max
+        scan.ranges, scan.angle_min, scan.angle_increment, scan.range_min, scan.longest_return
     )
     gaps = _gaps(
         points,

@@ -31,8 +31,8 @@ __all__ = ["Guess", "Run", "ScanAnswer", "read_line", "read_runs"]
 _TABLE = "answers.csv"
 _NO_ANSWER = (ValueError, KeyError, TypeError, AttributeError, RecursionError, OverflowError)
 # JSON lines pack to a fifth; a thousandth is a trap.
-_SMALL_TEXT = 1 << 24
-_MOST_FOLDED = 200
+_SMALL_TEXT = 1 << 22
+_MOST_FOLDED = 100
 _COLUMNS = ("protocol", "place", "method", "query", "x", "y", "theta", "probability", "seconds")
 
 

@@ -3,7 +3,8 @@
 Fields are those of ``sensor_msgs/LaserScan``; special values follow REP-117:
 ``+inf`` is "nothing within reach" (free space is known), ``-inf`` is "too close",
 NaN is "no information".  A reading is a *return* when
-``range_min <= range <= range_max``, which NaN fails.
+``range_min <= range <= range_max``, which NaN fails, and no longer than 10 km: what a message
+claims beyond that no laser has measured, and following such a ray through a map would take hours.
 """
 
 from __future__ import annotations
@@ -22,6 +23,8 @@ __all__ = ["LaserScan"]
 # So many readings may be missing to a full turn: some sensors leave out the one that would
 # complete it, and rounding of the increment takes a little more.
 _CLOSING_SLACK = 1.5
+# Longer readings, metres, are errors in the message, whatever its limit says.
+_LONGEST = 1e4
 # A smaller angle between readings, radians, is no angle but an error in the message.
 _SMALLEST_INCREMENT = 1e-9
 
@@ -112,17 +115,19 @@ class LaserScan:
     def is_return(self) -> NDArray[np.bool_]:
         """(N,) whether the reading hit something within the limits."""
         ranges = self.ranges
-        return (
-            (ranges >= self.range_min)
-            & (ranges <= self.range_max)
-            & (ranges > 0.0)
-            & np.isfinite(ranges)
-        )
+        with np.errstate(over="ignore"):  # limits may be beyond what float32 holds
+            is_long_enough = (ranges >= self.range_min) & (ranges > 0.0)
+        return is_long_enough & (ranges <= self.longest_return)
+
+    @property
+    def longest_return(self) -> float:
+        """Longest range that a return may have, metres: ``range_max``, or 10 km."""
+        return min(self.range_max, _LONGEST)
 
     @cached_property
     def is_free(self) -> NDArray[np.bool_]:
         """(N,) whether the reading found nothing within reach (REP-117 ``+inf``)."""
-        with np.errstate(invalid="ignore"):
+        with np.errstate(invalid="ignore", over="ignore"):
             return np.asarray(self.ranges > self.range_max)
 
     @cached_property

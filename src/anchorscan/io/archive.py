@@ -19,8 +19,8 @@ __all__ = ["BROKEN", "ZIP_MAGIC", "largest_content", "member_names", "open_archi
 ZIP_MAGIC = b"PK\x03\x04"
 
 # Recordings pack to a fifth; a thousandth, which deflate can reach, is a trap.
-_SMALL_CONTENT = 1 << 24
-_MOST_FOLDED = 200
+_SMALL_CONTENT = 1 << 22
+_MOST_FOLDED = 100
 
 # What gzip, zipfile and their decompressors raise on data that stops or was altered; a
 # RuntimeError is a member that wants a password, or a compression that Python does not have.

@@ -12,6 +12,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from ..errors import LogError, MissingExtraError
 from .bounded_file import BoundedPath
 from .frames import FrameTree, frame_name
@@ -33,6 +35,30 @@ POSE_TYPES = (
 _TF_TYPES = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 _STATIC = "tf_static"
 _NANO = 1e-9
+
+# What is read of a message.  A recording brings its own definitions, which may be anything.
+_HEADER = ("header.stamp.sec", "header.stamp.nanosec", "header.frame_id")
+_LIMITS = ("angle_min", "angle_increment", "range_min", "range_max")
+_POSITION = ("position.x", "position.y", "position.z")
+_ROTATION = ("orientation.x", "orientation.y", "orientation.z", "orientation.w")
+_TRANSLATION = ("translation.x", "translation.y", "translation.z")
+_TURN = ("rotation.x", "rotation.y", "rotation.z", "rotation.w")
+_TEXTS = ("frame_id", "child_frame_id")
+_ARRAYS = ("ranges", "transforms")
+_READ = {
+    **dict.fromkeys(SCAN_TYPES, (*_HEADER, *_LIMITS, "ranges")),
+    **dict.fromkeys(_TF_TYPES, ("transforms",)),
+    POSE_TYPES[0]: (*_HEADER, *(f"pose.{name}" for name in (*_POSITION, *_ROTATION))),
+    POSE_TYPES[1]: (*_HEADER, *(f"pose.pose.{name}" for name in (*_POSITION, *_ROTATION))),
+    POSE_TYPES[2]: (
+        *(*_HEADER, "child_frame_id"),
+        *(f"pose.pose.{name}" for name in (*_POSITION, *_ROTATION)),
+    ),
+}
+_READ_OF_TRANSFORM = (
+    *(*_HEADER, "child_frame_id"),
+    *(f"transform.{name}" for name in (*_TRANSLATION, *_TURN)),
+)
 
 
 class Recording:
@@ -187,7 +213,11 @@ class Recording:
             decoder = self._decoders.get(connection.msgtype)
             if decoder is None:
                 decoder = self._decoders[connection.msgtype] = self._decoder(connection)
-            return decoder(data)
+            message = decoder(data)
+            _check_fields(message, _READ.get(connection.msgtype, ()))
+            for transform in getattr(message, "transforms", ()):
+                _check_fields(transform, _READ_OF_TRANSFORM)
+            return message
         except Exception as error:
             return f"the message cannot be decoded: {_first_line(error)}"
 
@@ -210,6 +240,25 @@ class Recording:
         if self._is_ros1:
             return lambda data: store.deserialize_ros1(data, kind)
         return lambda data: store.deserialize_cdr(data, kind)
+
+
+def _check_fields(message: Any, fields: Iterable[str]) -> None:
+    """Check that a message has what is read of it.
+
+    Raises:
+        LogError: A field is missing, or holds something else.
+    """
+    for field in fields:
+        value, name = message, field.rpartition(".")[2]
+        for part in field.split("."):
+            value = getattr(value, part, None)
+        kinds: tuple[type, ...] = (int, float)
+        if name in _TEXTS:
+            kinds = (str,)
+        elif name in _ARRAYS:
+            kinds = (list, np.ndarray)
+        if not isinstance(value, kinds):
+            raise LogError(f"its definition has no {field} that can be read")
 
 
 def stamp_of(header: Any, time: float) -> float:

@@ -1,0 +1,72 @@
+"""Damage at random, the same every time: no target may fall, hang, or hoard memory.
+
+The long search is a command, ``make fuzz``; what it found stands in ``test_bad_input.py``.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import random
+import sys
+from pathlib import Path
+
+import pytest
+from fuzz.mutation import mutated
+from fuzz.targets import TARGETS, HungryError, SlowError, Target, execute
+
+# Executions that take about a second.
+RUNS = {"bag": 150, "bag-metadata": 100, "bag-message": 30, "set-sealed": 200, "map-scans": 200}
+RUNS |= {"scan": 200, "scan-paper": 200, "tum": 500, "set": 200, "map": 600}
+USUAL = 1000
+NEEDS = {"bag": "rosbags", "bag-metadata": "rosbags", "bag-message": "rosbags", "map": "PIL"}
+NEEDS |= {"map-scans": "PIL"}
+
+
+@pytest.mark.parametrize("name", TARGETS)
+def test_damage_at_random_does_no_harm(name: str, tmp_path: Path) -> None:
+    if name in NEEDS:
+        pytest.importorskip(NEEDS[name])
+    target = TARGETS[name]
+    seeds = target.seeds()
+    for seed in seeds:  # what is loaded and compiled once is nobody's fault
+        target.check(seed, tmp_path)
+    rng = random.Random(8)
+    for _ in range(RUNS.get(name, USUAL)):
+        data = mutated(rng, seeds, target.words)
+        try:
+            execute(target, data, tmp_path)
+        except Exception as error:
+            pytest.fail(f"{type(error).__name__}: {error} on {data!r}")
+
+
+def test_a_target_that_hangs_or_hoards_is_caught(tmp_path: Path) -> None:
+    def hang(data: bytes, folder: Path) -> None:
+        sum(range(10**8 if data else 0))
+
+    def hoard(data: bytes, folder: Path) -> None:
+        bytes(b"\1" * (3 << 30 if data else 0))
+
+    with pytest.raises(SlowError):
+        execute(Target("hang", list, hang), b"a", tmp_path)
+    if sys.platform == "linux" and not os.environ.get("CI"):
+        with pytest.raises(HungryError):
+            execute(Target("hoard", list, hoard), b"a", tmp_path)
+
+
+@pytest.mark.parametrize("name", ["settings", "csv"])
+def test_the_command_counts_its_executions(name: str, tmp_path: Path) -> None:
+    import subprocess
+
+    words = ["-m", "fuzz", name, "--runs", "50", "--engine", "random", "--findings", "found"]
+    home = Path(__file__).parent
+    done = subprocess.run(
+        [sys.executable, *words],
+        capture_output=True,
+        text=True,
+        cwd=home,
+        env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+        check=True,
+    )
+    assert f"{name}: 50 executions" in done.stdout
+    assert importlib.util.find_spec("fuzz") is not None
