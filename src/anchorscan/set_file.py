@@ -275,6 +275,7 @@ class SetFile:
             self._connection = _connect(path, "mode=rw")
             self._identity = _hold(path)
             self._size = path.stat().st_size
+            self._log = _mark_of(path)
             # Runs at the end of the process too: a set that nobody closed is one file even so.
             self._finish = weakref.finalize(
                 self, _abandon, self._connection, path, self._identity, os.getpid()
@@ -394,8 +395,9 @@ class SetFile:
         try:
             self.check()
         except ReferenceSetError:
-            self._connection.close()  # takes the log along, which belongs to no file any more
+            self._connection.close()
             _release(self._identity)
+            self._take_log_along()
             raise
         _fold_in(self._connection, self.path, self._identity)
 
@@ -405,6 +407,16 @@ class SetFile:
     def __exit__(self, *_: object) -> None:
         self.close()
 
+    def _take_log_along(self) -> None:
+        """Remove the log of a file that is gone, lest it be folded into the one in its place.
+
+        Only where nobody has written to it since; what is in it has no file any more.
+        """
+        if self._log is not None and _mark_of(self.path) == self._log:
+            for suffix in ("-wal", "-shm"):
+                with suppress(OSError):
+                    Path(f"{self.path}{suffix}").unlink()
+
     @contextmanager
     def _transaction(self) -> Iterator[sqlite3.Connection]:
         self.check()
@@ -412,6 +424,7 @@ class SetFile:
         try:
             yield self._connection
             self._connection.execute("COMMIT")
+            self._log = _mark_of(self.path)
         except BaseException:
             # A full disk has rolled back by itself; then there is no transaction to end.
             with suppress(sqlite3.Error):
@@ -587,6 +600,15 @@ def _check_name(name: str) -> None:
 _Identity = tuple[int, int]
 _held: dict[_Identity, int] = {}
 _opening = threading.RLock()
+
+
+def _mark_of(path: Path) -> tuple[int, ...] | None:
+    """Tell the log beside a file from any other, and from itself when somebody has written."""
+    try:
+        found = Path(f"{path}-wal").stat()
+    except OSError:
+        return None
+    return found.st_dev, found.st_ino, found.st_size, found.st_mtime_ns
 
 
 def _hold(path: Path) -> _Identity:
