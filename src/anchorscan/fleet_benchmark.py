@@ -170,12 +170,12 @@ def run(
         places.locate(asked[0].scan)  # derives the index
         for each, so_far in zip(asked, found, strict=True):
             so_far.append((name, *_timed(name, places, each.scan)))
-    results = [
-        outcome
-        for each, so_far in zip(asked, found, strict=True)
-        for size in sizes
-        for outcome in outcomes(each, so_far, size, settings.decision)
-    ]
+        for size in sizes:
+            if number == max(size, needed) - 1 + (size >= needed):
+                say(f"{size} sets:")
+                for line in _brief(_all_outcomes(asked, found, size, settings), settings):
+                    say(line)
+    results = [outcome for size in sizes for outcome in _all_outcomes(asked, found, size, settings)]
     for line in table(results, settings.decision):
         say(line)
     return results
