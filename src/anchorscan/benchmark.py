@@ -305,6 +305,7 @@ def run(
             say(f"{drive.name}: no protocol finds a query in it")
     if not todo:
         raise AnchorscanError("no split has a query: the drives visit no place twice")
+    start = time.perf_counter()
     if spread is None or not spread.workers:
         scores = [each for task in todo for each in measure(task, methods, queries, seed, progress)]
     else:
@@ -318,6 +319,10 @@ def run(
             baseline_queries,
         )
         scores = _measure_spread(plan, todo, methods, queries, seed, progress, spread)
+    if spread is not None:
+        count = sum(len(score.answers) for score in scores)
+        by = f"{spread.workers} workers" if spread.workers else "this process"
+        say(f"{count} questions answered in {time.perf_counter() - start:.1f} s by {by}")
     stages = [
         each
         for task in todo

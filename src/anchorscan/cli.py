@@ -317,7 +317,7 @@ def build(
         with cluster(scheduler, workers) as spread:
             _build_each(recipe, logs, output, index, spread)
         return
-    if len(logs) == 1 and scheduler is None and workers is None:
+    if len(logs) == 1:  # one piece: nothing to share
         _say(_built(recipe, logs[0], recipe.records(logs[0], _progress), output))
         _write_index(output, index)
         return

@@ -170,15 +170,37 @@ def run(
         places.locate(asked[0].scan)  # derives the index
         for each, so_far in zip(asked, found, strict=True):
             so_far.append((name, *_timed(name, places, each.scan)))
-    results = [
-        outcome
-        for each, so_far in zip(asked, found, strict=True)
-        for size in sizes
-        for outcome in outcomes(each, so_far, size, settings.decision)
-    ]
+        for size in sizes:
+            if number == max(size, needed) - 1 + (size >= needed):
+                say(f"{size} sets:")
+                for line in _brief(_all_outcomes(asked, found, size, settings), settings):
+                    say(line)
+    results = [outcome for size in sizes for outcome in _all_outcomes(asked, found, size, settings)]
     for line in table(results, settings.decision):
         say(line)
     return results
+
+
+def _all_outcomes(
+    asked: Sequence[Asked],
+    found: Sequence[Sequence[tuple[str, BuildingFits | None, float]]],
+    size: int,
+    settings: Settings,
+) -> list[Outcome]:
+    return [
+        outcome
+        for each, so_far in zip(asked, found, strict=True)
+        for outcome in outcomes(each, so_far, size, settings.decision)
+    ]
+
+
+def _brief(results: Sequence[Outcome], settings: Settings) -> Iterator[str]:
+    """Give the rows of one size, as soon as they are known: a thousand sets take their time."""
+    for is_real in (True, False):
+        some = [each for each in results if each.asked.is_real == is_real]
+        if some:
+            yield "real" if is_real else "simulated"
+            yield from _rows(some, LOOK_ALIKES, settings.decision)
 
 
 def twins(cases: Sequence[Case], settings: Settings, queries: int, seed: int = 0) -> Iterator[str]:
