@@ -255,7 +255,7 @@ def decide_over(
 
 def no_twin(margin: float) -> float:
     """Return the most that an answer can be worth, by its margin to the best other building."""
-    return 1.0 - 0.5 * math.exp(-0.5 * (margin / TWINS) ** 2)
+    return 1.0 - 0.5 * math.exp(-0.5 * (max(margin, 0.0) / TWINS) ** 2)
 
 
 def ranked(found: Sequence[BuildingFits]) -> tuple[list[tuple[BuildingFits, int]], Fits]:
