@@ -108,7 +108,7 @@ def ask(path: Path) -> None:
         assert reference.pose is not None
         right += best.pose.distance(reference.pose) < 0.5
     tell("answer", spent)
-    print(f"of {ASKED} scans {right} were placed where they are", flush=True)
+    print(f"of {ASKED} scans {right} were placed there, the others at their likes", flush=True)
     change(places, identifiers)
     print(f"memory: {memory():.0f} MB")
 

@@ -241,6 +241,24 @@ def test_info_says_what_a_set_holds(run: Run, places: Path, records: list[Record
     assert "181 readings over 180 degrees" in words.out
 
 
+def test_an_index_is_written_when_asked_for_and_info_says_how_it_is(
+    run: Run, records: list[Record], tmp_path: Path
+) -> None:
+    log, places = write_log(tmp_path / "drive.log", records), tmp_path / "indexed.apr"
+    assert run("build", log, "-o", places).code == 0
+    assert not (tmp_path / "indexed.apr.index").exists()  # a small set has none by itself
+    assert json.loads(run("info", places, "--json").out)["index"] is None
+    before = [line["hypotheses"] for line in run("locate", places, log).lines]
+    assert "indexed.apr.index: " in run("build", log, "-o", places, "--index").err
+    assert json.loads(run("info", places, "--json").out)["index"]["state"] == "current"
+    assert [line["hypotheses"] for line in run("locate", places, log).lines] == before
+    (tmp_path / "indexed.apr.index").write_bytes(b"something else")
+    assert "outdated or damaged, not used" in run("info", places).out
+    assert [line["hypotheses"] for line in run("locate", places, log).lines] == before
+    assert run("index", places).code == 0
+    assert "current" in run("info", places).out
+
+
 def test_field_of_view_and_range_max_reach_the_scans(
     run: Run, records: list[Record], tmp_path: Path
 ) -> None:
@@ -295,7 +313,7 @@ def test_settings_come_from_a_preset_or_a_file(
 def test_version_and_help(run: Run) -> None:
     assert run("--version").out == f"anchorscan {__version__}\n"
     text = run("--help").out
-    for name in ("build", "locate", "track", "explain", "info", "bench", "check-map", "demo"):
+    for name in ("build", "locate", "track", "explain", "info", "index", "bench", "check-map"):
         assert f"\n  {name} " in text
         assert run(name, "--help").code == 0
 

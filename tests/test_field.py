@@ -419,6 +419,25 @@ def test_adding_and_removing_are_exact_opposites(seed, motion):
         np.testing.assert_array_equal(layer, copy)
 
 
+def test_a_map_that_changes_for_long_stays_what_it_is_and_small():
+    scans, others = placed(3, 5), placed(2, 6, Pose2D(90.0, -150.0, 0.4))
+    field = LikelihoodField(COARSE, scans)
+    before = all_bytes(field)
+    largest = 0
+    for k in range(150):
+        snapshot = field.tiles
+        kept = [layer.copy() for layer in snapshot[:4]]
+        scan, pose = others[k % 2]
+        field.add(scan, pose)
+        field.remove(scan, pose)
+        largest = max(largest, len(field.tiles.codes) // 4096)
+        if k % 10 == 0:
+            assert all_bytes(field) == before
+            for layer, copy in zip(snapshot[:4], kept, strict=True):
+                np.testing.assert_array_equal(layer, copy)
+    assert largest < 4000  # outlived versions of tiles make room for others
+
+
 @pytest.mark.parametrize("x", [-60.0, 0.0, 60.0])
 @pytest.mark.parametrize("y", [-60.0, 0.0, 60.0])
 def test_the_map_grows_in_any_direction(x, y):

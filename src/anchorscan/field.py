@@ -411,7 +411,8 @@ class LikelihoodField:
             kept = np.unique(self._table[np.unique(np.append(self._pages, 0))])
             numbers = np.zeros(self._used, np.int32)
             numbers[kept] = np.arange(len(kept), dtype=np.int32)
-            self._table, self._table_published = numbers[self._table], 1
+            named = numbers[self._table[: self._table_used]]
+            self._table, self._table_published = _grown(named, len(self._table)), 1
         room = len(kept) + count + max(len(kept) // 2, _GROUP // 2)
         self._codes = _grown(self._codes[kept], room)
         self._coarse = _grown(self._coarse[kept], room)
