@@ -167,7 +167,7 @@ def test_a_drive_is_tracked_from_nothing(
 def test_processes_share_the_work_and_change_nothing(log: Path, places: Path) -> None:
     # In processes of their own: pytest's captured streams do not survive a spawn.
     outcomes = []
-    for count in ("1", "2"):
+    for count in ("1", "2", "all"):
         done = subprocess.run(
             command("locate", places, log, "--processes", count),
             capture_output=True,
@@ -175,7 +175,7 @@ def test_processes_share_the_work_and_change_nothing(log: Path, places: Path) ->
             check=True,
         )
         outcomes.append(without_time(Outcome(0, done.stdout, "").lines))
-    assert outcomes[0] == outcomes[1]
+    assert outcomes[0] == outcomes[1] == outcomes[2]
 
 
 def without_time(lines: list[dict[str, Any]]) -> list[dict[str, Any]]:

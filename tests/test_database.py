@@ -210,7 +210,7 @@ def oriented_graph(seed):
         ("postings", lambda a: a[:-1]),
         ("sizes", lambda a: a[:-1]),
         ("sizes", lambda a: -a - 1),
-        ("identifiers", lambda a: np.zeros_like(a)),
+        ("identifiers", np.zeros_like),
         ("identifiers", lambda a: None),
         ("slots", lambda a: a + np.int32(100)),
         ("slots", lambda a: a - np.int32(100)),

@@ -163,6 +163,16 @@ def _parse_candidates(text: str) -> int | str:
     raise typer.BadParameter(f"{text!r} is neither a positive number nor 'all'")
 
 
+def _parse_processes(text: str) -> int:
+    if text == "all":
+        # What this process may use, which in a container is less than the machine has.
+        affinity = getattr(os, "sched_getaffinity", None)
+        return len(affinity(0)) if affinity else os.cpu_count() or 1
+    if text.isdecimal() and int(text) > 0:
+        return int(text)
+    raise typer.BadParameter(f"{text!r} is neither a positive number nor 'all'")
+
+
 def _parse_laser(text: str) -> Pose2D:
     from .pose import Pose2D
 
@@ -464,7 +474,12 @@ def locate(
         typer.Option("--output", "-o", metavar="OUT", help="File for the JSON lines, not stdout."),
     ] = None,
     processes: Annotated[
-        int, typer.Option(min=1, metavar="N", help="Share the scans among processes.")
+        Any,
+        typer.Option(
+            parser=_parse_processes,
+            metavar="N|all",
+            help="Share the scans among processes; all takes every core.",
+        ),
     ] = 1,
     field_of_view: FieldOfViewOption = None,
     range_max: RangeMaxOption = None,

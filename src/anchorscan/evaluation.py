@@ -147,9 +147,7 @@ def outline(scan: LaserScan, angles: AngleFunction) -> Outline:
         scan: The scan.
         angles: Its angle function, which knows what belongs to one surface.
     """
-    rows = np.empty((len(angles.ranges), 5))
-    rows[:, :2] = angles.points
-    rows[:, _RANGE], rows[:, _BEAM], rows[:, _GAP] = angles.ranges, angles.beams, angles.gaps
+    rows = _rows(angles.points, angles.ranges, angles.beams, angles.gaps)
     step = abs(scan.angle_increment) or 1.0
     count = max(min(len(scan), int(_FULL_TURN / step + 0.5)), 1)
     first = scan.angle_min + min(scan.angle_increment, 0.0) * (count - 1)
@@ -282,6 +280,16 @@ def synthetic_scan(
 
 _NO_ROWS = np.empty((0, 5))
 _NO_GEOMETRIES = np.empty((0, 4))
+
+
+@kernel
+def _rows(points, ranges, beams, gaps):  # type: ignore[no-untyped-def]
+    """Columns of an outline in one table."""
+    rows = np.empty((len(ranges), 5))
+    for i in range(len(ranges)):
+        rows[i, _X], rows[i, _Y] = points[i, 0], points[i, 1]
+        rows[i, _RANGE], rows[i, _BEAM], rows[i, _GAP] = ranges[i], beams[i], gaps[i]
+    return rows
 
 
 @kernel

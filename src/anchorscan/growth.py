@@ -38,7 +38,7 @@ from .anchors import AnchorPoints
 from .array_file import read_arrays, write_arrays
 from .database import RelationshipDatabase
 from .description import Description, describe
-from .errors import MissingExtraError
+from .errors import AnchorscanError, MissingExtraError
 from .field import LikelihoodField
 from .graph import AnchorGraph
 from .pose import Pose2D
@@ -50,7 +50,7 @@ from .settings import Settings
 from .simulator import SensorModel, random_building, random_poses, simulate
 from .verification import verify
 
-__all__ = ["RANKS", "SIZES", "Growth", "Place", "Size", "distractors", "measure", "slope"]
+__all__ = ["RANKS", "SIZES", "Growth", "Place", "Scene", "Size", "distractors", "measure", "slope"]
 
 RANKS = (1, 5, 20, 100)
 SIZES = (100, 1_000, 10_000, 100_000, 1_000_000)
@@ -61,8 +61,8 @@ _LOST = 0.15
 _POSITION_NOISE, _DIRECTION_NOISE = 0.03, 0.03
 _MIRRORED = np.array([1, 0, 2, 3, 4])
 _FEWEST_ANCHORS = 3
-# Of a real log and of a simulated building so many scans are made into distractors.
-_REAL_SCANS, _BUILDINGS, _SIMULATED_SCANS = 400, 60, 40
+# So many scans of a real building and of a simulated one are made into distractors.
+_REAL_SCANS, _SIMULATED_SCANS = 400, 40
 # Identifiers of distractors begin beyond those of any place.
 _FIRST_DISTRACTOR = 1 << 40
 _CHANGES = 400
@@ -210,6 +210,7 @@ def measure(
     sizes: Sequence[int] = SIZES,
     queries: int | None = None,
     seed: int = 0,
+    buildings: int = 60,
     say: Callable[[str], None] = lambda line: None,
 ) -> Growth:
     """Search for the candidates of real queries among more and more distractors.
@@ -220,13 +221,21 @@ def measure(
         sizes: Numbers of distractors; that without any is measured as well.
         queries: At most so many of each place, at equal steps.
         seed: Of the distractors and of the choice of queries.
+        buildings: Simulated ones that half of the distractors are made from.
         say: Is told what has been measured.
+
+    Raises:
+        AnchorscanError: There is no query.
     """
     asked = [
-        _Asked(place, settings, thin(range(len(place.queries)), queries, seed)) for place in places
+        _Asked(place, settings, thin(range(len(place.queries)), queries, seed))
+        for place in places
+        if place.queries
     ]
+    if not asked:
+        raise AnchorscanError("no log visits a place twice: there is nothing to ask")
     say(f"{sum(len(each.queries) for each in asked)} queries in {len(asked)} places")
-    pool = _pool(places, settings, seed)
+    pool = _pool(places, settings, buildings, seed)
     say(f"{len(pool)} scans to make distractors from")
     _warm_up(asked[0], settings)
     measured = []
@@ -254,8 +263,13 @@ def slope(counts: Sequence[float], milliseconds: Sequence[float]) -> float:
 
 
 @dataclass(frozen=True, eq=False)
-class _Scene:
-    """Anchor points in the frame of their main walls."""
+class Scene:
+    """Anchor points in the frame of their main walls, to make distractors from.
+
+    Args:
+        building: Empty for a simulated one.
+        anchors: With the main angle zero.
+    """
 
     building: str
     anchors: AnchorPoints
@@ -306,7 +320,7 @@ def _pose(reference: Reference) -> Pose2D:
     return reference.pose
 
 
-def _pool(places: Sequence[Place], settings: Settings, seed: int) -> list[_Scene]:
+def _pool(places: Sequence[Place], settings: Settings, buildings: int, seed: int) -> list[Scene]:
     """What distractors are made from: scans of all places and of simulated buildings."""
     found: list[tuple[str, LaserScan]] = []
     for place in {place.building: place for place in places}.values():
@@ -314,12 +328,12 @@ def _pool(places: Sequence[Place], settings: Settings, seed: int) -> list[_Scene
         found += [(place.building, scan) for scan in place.others[::step]]
     rng = np.random.default_rng(seed)
     sensor = SensorModel()
-    for number in range(_BUILDINGS):
+    for number in range(buildings):
         world = random_building(seed + number)
         for pose in random_poses(world, _SIMULATED_SCANS, seed + number):
             found.append(("", simulate(world, pose, sensor, rng)))
     scenes = [
-        _Scene(building, _upright(describe(scan, settings).anchors)) for building, scan in found
+        Scene(building, _upright(describe(scan, settings).anchors)) for building, scan in found
     ]
     return [scene for scene in scenes if len(scene.anchors) >= _FEWEST_ANCHORS]
 
@@ -332,9 +346,7 @@ def _upright(anchors: AnchorPoints) -> AnchorPoints:
     return AnchorPoints(positions, anchors.kinds, anchors.directions - main, 0.0)
 
 
-def distractors(
-    pool: Sequence[_Scene], count: int, seed: int
-) -> Iterator[tuple[int, AnchorPoints]]:
+def distractors(pool: Sequence[Scene], count: int, seed: int) -> Iterator[tuple[int, AnchorPoints]]:
     """Make references of other places; the first are the same whatever their number.
 
     Yields:
@@ -379,7 +391,7 @@ _NO_NODES, _NO_VALUES = np.empty((0, 2), np.int32), np.empty(0)
 
 
 def _measured(
-    count: int, asked: Sequence[_Asked], pool: Sequence[_Scene], settings: Settings, seed: int
+    count: int, asked: Sequence[_Asked], pool: Sequence[Scene], settings: Settings, seed: int
 ) -> Size:
     """Measure among one number of distractors."""
     bases = np.empty(count, np.int32)

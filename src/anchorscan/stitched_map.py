@@ -298,7 +298,7 @@ class StitchedMap:
             T_reference_scan,
             settings.evaluation,
         )
-        covariances = covariance(fits, settings.decision)
+        covariances = covariance(fits[:count], settings.decision)
         hypotheses = tuple(
             Hypothesis(
                 reference=each.reference.identifier,
