@@ -57,9 +57,15 @@ def jittered(anchors, seed, size=0.03):
 # A plain twin of the relation.
 
 
-def in_walls(anchors):
+def directions_in_walls(anchors):
+    return anchors.directions - anchors.main_angle
+
+
+def vector_in_walls(anchors, a, b):
+    # Rounded as in the kernel: an edge along a wall lies at the border of two cells.
     c, s = math.cos(anchors.main_angle), math.sin(anchors.main_angle)
-    return anchors.positions @ np.array([[c, -s], [s, c]]), anchors.directions - anchors.main_angle
+    dx, dy = anchors.positions[b] - anchors.positions[a]
+    return np.array([c * dx + s * dy, c * dy - s * dx])
 
 
 def folded(kinds, sectors, cell):
@@ -78,12 +84,12 @@ def is_used(vector):
 
 
 def plain_keys(anchors):
-    positions, directions = in_walls(anchors)
+    directions = directions_in_walls(anchors)
     kinds = anchors.kinds.tolist()
     keys = set()
     for n, m in itertools.combinations(range(len(kinds)), 2):
         a, b = (n, m) if kinds[n] <= kinds[m] else (m, n)
-        vector = positions[b] - positions[a]
+        vector = vector_in_walls(anchors, a, b)
         if is_used(vector):
             sectors = (sector_of(directions[a]), sector_of(directions[b]))
             cell = tuple(math.floor(v / SETTINGS.cell) for v in vector)
@@ -92,12 +98,12 @@ def plain_keys(anchors):
 
 
 def plain_cells(anchors):
-    positions, directions = in_walls(anchors)
+    directions = directions_in_walls(anchors)
     kinds = anchors.kinds.tolist()
     near, cell = SETTINGS.position_tolerance, SETTINGS.cell
     wide = SETTINGS.direction_tolerance * 8.0 / (2.0 * math.pi)
     for a, b in itertools.permutations(range(len(kinds)), 2):
-        vector = positions[b] - positions[a]
+        vector = vector_in_walls(anchors, a, b)
         if kinds[a] > kinds[b] or not is_used(vector):
             continue
         spans = [

@@ -156,7 +156,13 @@ class Growth:
                 f"{s.milliseconds_changing:>6.2f}) {s.adding:>9.2f}  {s.removing:>6.2f}     "
                 f"{hits}   {located}"
             )
-        return [*rows, f"time grows with the number of references to the power {self.slope:.2f}"]
+        last = self.sizes[-2:]
+        end = slope([s.references for s in last], [s.milliseconds for s in last])
+        return [
+            *rows,
+            f"time grows with the number of references to the power {self.slope:.2f} over all "
+            f"sizes, {end:.2f} between the last two",
+        ]
 
     def write(self, folder: Path) -> list[Path]:
         """Write growth.json and growth.csv, and return their paths.
@@ -249,7 +255,10 @@ def _warm_up(asked: _Asked, settings: Settings) -> None:
     """Compile all that is timed."""
     graphs = [known.graph for known in asked.known[:2]] * 3
     database = RelationshipDatabase(settings.database, enumerate(graphs))
-    database = RelationshipDatabase.from_arrays(settings.database, database.arrays())
+    arrays = database.arrays()
+    for array in arrays.values():
+        array.flags.writeable = False  # as mapped ones are: kernels are compiled for these apart
+    database = RelationshipDatabase.from_arrays(settings.database, arrays)
     database.add(len(graphs), graphs[0])
     database.votes(graphs[0], RANKS[-1])
     database.remove(0)
