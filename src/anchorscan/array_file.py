@@ -4,6 +4,8 @@ A short line of JSON says what the file was made of and where every array lies, 
 and what its checksum is; the arrays follow, each at a multiple of 64 bytes, little endian.
 Nothing in the file is code and nothing is pickled.  A file is written beside its place and
 renamed, so that readers see the old one or the new one, and keep the one that they have opened.
+Who changes a file in its place instead, or cuts it short, pulls it from under its readers: the
+system ends them.
 
 What is mapped may be written to: changes are this process's own and never reach the file.  An
 array may have *room* behind it, a hole in the file that takes no place on the disk until then.

@@ -163,7 +163,8 @@ def _parse_candidates(text: str) -> int | str:
     raise typer.BadParameter(f"{text!r} is neither a positive number nor 'all'")
 
 
-def _parse_processes(text: str) -> int:
+def _parse_processes(text: str | int) -> int:
+    text = str(text)  # the default comes as the number that it is
     if text == "all":
         # What this process may use, which in a container is less than the machine has.
         affinity = getattr(os, "sched_getaffinity", None)
