@@ -5,6 +5,8 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 PYTEST_ARGS ?=
+# Files of tests share the cores; PYTEST_SHARE= runs them one after the other.
+PYTEST_SHARE ?= --numprocesses auto --dist loadfile
 FUZZ_TARGETS ?=
 FUZZ_RUNS ?= 1000000
 FUZZ_SECONDS ?= 3600
@@ -34,7 +36,7 @@ check: setup ## lint, format and types
 	$(BIN)/mypy
 
 test: check ## check, then every test
-	$(BIN)/python -m pytest $(PYTEST_ARGS)
+	$(BIN)/python -m pytest $(PYTEST_SHARE) $(PYTEST_ARGS)
 
 ros-test: $(VENV)-ros/.ready ## the ROS 2 node on the wire, in an environment of its own
 	ANCHORSCAN_REQUIRE_ROS=1 $(VENV)-ros/bin/python -m pytest tests/ros $(PYTEST_ARGS)
