@@ -80,7 +80,9 @@ def _parameters(callback: Callable[..., Any]) -> Iterator[_Parameter]:
             # Inside Annotated the first name stands where a default value would.
             words = map(str, (note.default, *(note.param_decls or ())))
             names = [word for word in words if word.startswith("-")]
-            shown = ", ".join(sorted(names or [f"--{name.replace('_', '-')}"], key=len))
+            long = name.replace("_", "-")
+            usual = f"--{long} / --no-{long}" if bool in (kind, *get_args(kind)) else f"--{long}"
+            shown = ", ".join(sorted(names or [usual], key=len))
             value = _metavar(kind, note)
             yield _Parameter(
                 value if is_argument else f"{shown} {value}".strip(),
@@ -96,7 +98,9 @@ def _metavar(kind: Any, note: Any) -> str:
         return str(note.metavar)
     if isinstance(kind, type) and issubclass(kind, Enum):
         return "|".join(str(each.value) for each in kind)
-    return {bool: "", int: "N", float: "X"}.get(kind, "TEXT")
+    if bool in (kind, *get_args(kind)):
+        return ""
+    return {int: "N", float: "X"}.get(kind, "TEXT")
 
 
 def _default(value: Any) -> str:

@@ -303,7 +303,7 @@ def test_a_full_list_of_proposals_stays_full():
     anchors, _, pose = seen(5)
     known = landmarks([(anchors, pose)], LIMITS)
     arguments = query_of(anchors), known, numbers_of(LIMITS)
-    assert edge_proposals(*arguments, np.empty((3, 3))) == 3
+    assert edge_proposals(*arguments, np.empty((3, 3)), 0) == 3
     assert lone_proposals(*arguments, np.empty((3, 3)), 2) == 3
     assert lone_proposals(*arguments, np.empty((3, 3)), 3) == 3
 
@@ -315,7 +315,7 @@ def test_planted_edges_are_proposed(seed):
     out = np.empty((4096, 3))
     lengths = [math.dist(a, b) for a, b in itertools.combinations(scan.positions, 2)]
     within = [LIMITS.shortest_edge + 0.1 < d < LIMITS.longest_edge - 0.1 for d in lengths]
-    found = edge_proposals(query_of(scan), known, numbers_of(LIMITS), out)
+    found = edge_proposals(query_of(scan), known, numbers_of(LIMITS), out, 0)
     off = np.hypot(out[:found, 0] - pose.x, out[:found, 1] - pose.y) < 0.5
     off &= turn_between(out[:found, 2] * UNIT, pose.theta) < 0.15
     # Every edge of the scan that is not too short or too long finds its own.
@@ -335,9 +335,9 @@ def test_the_opposite_direction_is_no_correspondence():
         away = AnchorPoints(anchors.positions, anchors.kinds, (units + (1 << 15)) * UNIT)
         known = landmarks([(facing, Pose2D())], LIMITS)
         out = np.empty((16, 3))
-        assert edge_proposals(query_of(facing), known, numbers_of(LIMITS), out) >= 1
+        assert edge_proposals(query_of(facing), known, numbers_of(LIMITS), out, 0) >= 1
         if anchors.kinds[0] != anchors.kinds[1]:
-            assert edge_proposals(query_of(away), known, numbers_of(LIMITS), out) == 0
+            assert edge_proposals(query_of(away), known, numbers_of(LIMITS), out, 0) == 0
 
 
 def test_a_mirror_image_is_not_proposed():
@@ -349,8 +349,8 @@ def test_a_mirror_image_is_not_proposed():
     image = AnchorPoints(corners * (1.0, -1.0), swapped, -directions)
     out = np.empty((64, 3))
     itself = AnchorPoints(corners, kinds, directions)
-    assert edge_proposals(query_of(itself), known, numbers_of(LIMITS), out) == 6
-    assert edge_proposals(query_of(image), known, numbers_of(LIMITS), out) == 0
+    assert edge_proposals(query_of(itself), known, numbers_of(LIMITS), out, 0) == 6
+    assert edge_proposals(query_of(image), known, numbers_of(LIMITS), out, 0) == 0
 
 
 def test_mirror_images_of_scans_are_hardly_proposed():
@@ -368,8 +368,8 @@ def test_mirror_images_of_scans_are_hardly_proposed():
         anchors, scan, pose = seen(number)
         known = landmarks([(real(anchors), pose)], LIMITS)
         image = anchor_points(mirrored(scan), DEFAULT.anchors)
-        own += edge_proposals(query_of(real(anchors)), known, numbers_of(LIMITS), out)
-        others += edge_proposals(query_of(real(image)), known, numbers_of(LIMITS), out)
+        own += edge_proposals(query_of(real(anchors)), known, numbers_of(LIMITS), out, 0)
+        others += edge_proposals(query_of(real(image)), known, numbers_of(LIMITS), out, 0)
     assert others < 0.25 * own
 
 

@@ -100,7 +100,11 @@ def angle_function(scan: LaserScan, settings: AngleFunctionSettings) -> AngleFun
     """
     step = abs(scan.angle_increment)
     points, ranges, beams, indices, count = _returns(
-        scan.ranges, scan.angle_min, scan.angle_increment, scan.range_min, scan.longest_return
+        scan.ranges,
+        scan.angle_min,
+        scan.angle_increment,
+        scan.shortest_return,
+        scan.longest_return,
     )
     gaps = _gaps(
         points,

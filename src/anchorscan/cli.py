@@ -1499,18 +1499,17 @@ def _refuse_mirrored(places: ReferenceSet, log: Log) -> None:
 
 def _map_records(
     path: Path, field_of_view: float | None, range_max: float | None, spacing: float, heading: float
-) -> Iterator[Record]:
+) -> Iterable[Record]:
     """Take scans all over a map, with the laser that was named or one that looks all around."""
     from .map_file import load_map
     from .occupancy import MAP_SENSOR, reference_scans
 
     sensor = MAP_SENSOR
     if field_of_view is not None:
-        sensor = replace(sensor, field_of_view=math.radians(field_of_view))
+        sensor = replace(sensor, field_of_view=field_of_view)
     if range_max is not None:
         sensor = replace(sensor, range_max=range_max)
-    grid = load_map(path)
-    return _progress(reference_scans(grid, sensor, spacing=spacing, heading=heading), "simulating")
+    return reference_scans(load_map(path), sensor, spacing=spacing, heading=heading)
 
 
 def _answer_now(places: ReferenceSet, record: Record) -> ScanAnswer:

@@ -115,14 +115,18 @@ class LaserScan:
     def is_return(self) -> NDArray[np.bool_]:
         """(N,) whether the reading hit something within the limits."""
         ranges = self.ranges
-        with np.errstate(over="ignore"):  # limits may be beyond what float32 holds
-            is_long_enough = (ranges >= self.range_min) & (ranges > 0.0)
+        is_long_enough = (ranges >= self.shortest_return) & (ranges > 0.0)
         return is_long_enough & (ranges <= self.longest_return)
 
     @property
+    def shortest_return(self) -> float:
+        """Shortest range that a return may have, metres: ``range_min`` as a reading holds it."""
+        return float(np.float32(min(self.range_min, 2.0 * _LONGEST)))
+
+    @property
     def longest_return(self) -> float:
-        """Longest range that a return may have, metres: ``range_max``, or 10 km."""
-        return min(self.range_max, _LONGEST)
+        """Longest range of a return, metres: ``range_max`` as a reading holds it, or 10 km."""
+        return float(np.float32(min(self.range_max, _LONGEST)))
 
     @cached_property
     def is_free(self) -> NDArray[np.bool_]:

@@ -21,10 +21,9 @@ from typing import Protocol, TypeVar
 
 import numpy as np
 
-from .benchmark import Task
 from .plausibility import Plausibility, mirror_check, mirror_image
 from .pose import Pose2D
-from .protocol import CORRECT_HEADING, CORRECT_POSITION, thin
+from .protocol import CORRECT_HEADING, CORRECT_POSITION, Split, thin
 from .record import Record
 from .reference_set import ReferenceSet
 from .scan import LaserScan
@@ -52,6 +51,38 @@ class ProgressOf(Protocol):
     ) -> Iterable[Item]: ...
 
 
+class Drive(Protocol):
+    """A recorded drive."""
+
+    @property
+    def records(self) -> Sequence[Record]:
+        """Its records, in order."""
+
+
+class Case(Protocol):
+    """Scans of a place that is known."""
+
+    @property
+    def protocol(self) -> str:
+        """How they were chosen."""
+
+    @property
+    def place(self) -> str:
+        """What tables call it."""
+
+    @property
+    def known(self) -> Drive:
+        """The drive that the references come from."""
+
+    @property
+    def asked(self) -> Drive:
+        """The drive that the queries come from."""
+
+    @property
+    def split(self) -> Split:
+        """Which records of both."""
+
+
 @dataclass(frozen=True)
 class Told:
     """Answers that were accepted, and those of them that are right."""
@@ -65,7 +96,7 @@ class Told:
 
 
 def run(
-    tasks: Sequence[Task],
+    tasks: Sequence[Case],
     settings: Settings,
     queries: int,
     seed: int,
@@ -116,7 +147,7 @@ def displaced(
     return moved, chosen
 
 
-def _row(task: Task, settings: Settings, queries: int, seed: int) -> list[object]:
+def _row(task: Case, settings: Settings, queries: int, seed: int) -> list[object]:
     known = [task.known.records[position] for position in task.split.references]
     asked = [task.asked.records[position] for position in thin(task.split.queries, queries, seed)]
     places = _set(known, settings)
