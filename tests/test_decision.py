@@ -21,7 +21,15 @@ from anchorscan import (
     random_building,
     simulate,
 )
-from anchorscan.decision import DecisionSettings, covariance, decide, evidence, held
+from anchorscan.decision import (
+    DecisionSettings,
+    _shared,
+    _worths,
+    covariance,
+    decide,
+    evidence,
+    held,
+)
 from anchorscan.verification import FEATURES, Fits
 from anchorscan.world import World
 
@@ -283,3 +291,22 @@ def test_evidence_is_what_the_text_says() -> None:
     expected = [1.0, math.log(margin), math.log(10.0), 0.2, math.log(601.0), math.log(8.0)]
     np.testing.assert_allclose(numbers, expected)
     assert np.all(np.isfinite(evidence(fits_of([1.0, 1.0], readings=0), 0)))
+
+
+@given(best=shares, scores=scores_of_fits, through=shares, rivalry=st.floats(0.1, 100.0))
+def test_what_the_best_leaves_is_shared_as_the_text_says(
+    best: float, scores: list[float], through: float, rivalry: float
+) -> None:
+    fits = fits_of(scores, through)
+    features = np.nan_to_num(fits.features)
+    worths = _worths(features)
+    expected = [
+        -math.log(1.0 - min(score, 0.995)) - math.sqrt(ray)
+        for score, ray in features[:, [SCORE, THROUGH]].tolist()
+    ]
+    np.testing.assert_allclose(worths, expected)
+    given_to, elsewhere = _shared(best, worths, 1.5, rivalry)
+    rivals = np.exp(rivalry * (np.array([*expected[1:], 1.5]) - max([*expected[1:], 1.5])))
+    plain = np.minimum((1.0 - best) * rivals[:-1] / rivals.sum(), best)
+    np.testing.assert_allclose(given_to, [best, *plain], atol=1e-12)
+    np.testing.assert_allclose(elsewhere, max(1.0 - best - plain.sum(), 0.0), atol=1e-12)

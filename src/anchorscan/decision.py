@@ -119,8 +119,10 @@ def evidence(fits: Fits, anchors: int) -> NDArray[np.float64]:
         anchors: How many anchor points the scan has.
     """
     score, through = (float(fits.features[0, k]) for k in (_SCORE, _THROUGH))
-    rival = worths(fits[1:2])[0] if len(fits) > 1 else worth(0.5 * score, 0.0)
-    margin = max(worth(score, through) - rival, _SMALLEST_MARGIN)
+    rival = (0.5 * score, 0.0)
+    if len(fits) > 1:
+        rival = float(fits.features[1, _SCORE]), float(fits.features[1, _THROUGH])
+    margin = max(worth(score, through) - worth(*rival), _SMALLEST_MARGIN)
     rest = 1.0 - min(score, _LARGEST_SCORE)
     rest += _LUCKY_READINGS * max(0.0, 1.0 / max(fits.readings, 1) - 1.0 / _MANY_READINGS)
     return np.array(
@@ -198,17 +200,43 @@ def decide(fits: Fits, anchors: int, settings: DecisionSettings) -> Decision:
         return Decision(np.empty(0), 1.0, False)
     place = _logistic(float(np.dot(evidence(fits, anchors), settings.weights)))
     best = place * held(covariance(fits[:1], settings)[0])
-    left = np.append(worths(fits[1:]), worth(settings.elsewhere, 0.0))
-    rivals = np.exp(settings.rivalry * (left - left.max()))
-    shares = (1.0 - best) * rivals[:-1] / rivals.sum()
-    probabilities = np.array([best, *np.minimum(shares, best)])
-    elsewhere = max(1.0 - float(probabilities.sum()), 0.0)
+    probabilities, elsewhere = _shared(
+        best, _worths(fits.features), worth(settings.elsewhere, 0.0), settings.rivalry
+    )
     return Decision(probabilities, elsewhere, best >= settings.threshold)
 
 
 def worths(fits: Fits) -> NDArray[np.float64]:
     """Return (F,) what the fits are ordered by."""
-    return np.array([worth(*pair) for pair in fits.features[:, [_SCORE, _THROUGH]].tolist()])
+    ordered_by: NDArray[np.float64] = _worths(fits.features)
+    return ordered_by
+
+
+@kernel
+def _worths(features):  # type: ignore[no-untyped-def]
+    out = np.empty(len(features))
+    for k in range(len(features)):
+        out[k] = worth(features[k, _SCORE], features[k, _THROUGH])
+    return out
+
+
+@kernel
+def _shared(best, worths, elsewhere, rivalry):  # type: ignore[no-untyped-def]
+    """What the best leaves, shared among the other fits and "somewhere else"."""
+    highest = elsewhere
+    for value in worths[1:]:
+        highest = max(highest, value)
+    total = math.exp(rivalry * (elsewhere - highest))
+    for value in worths[1:]:
+        total += math.exp(rivalry * (value - highest))
+    probabilities = np.empty(len(worths))
+    probabilities[0] = best
+    left = 1.0 - best
+    for k in range(1, len(worths)):
+        share = (1.0 - best) * math.exp(rivalry * (worths[k] - highest)) / total
+        probabilities[k] = min(share, best)
+        left -= probabilities[k]
+    return probabilities, max(left, 0.0)
 
 
 def _logistic(value: float) -> float:
