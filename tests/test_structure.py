@@ -19,7 +19,8 @@ ROOT = PACKAGE.parents[1]
 # In the order of the data flow: a file imports only files that stand before it.  A new file
 # gets its place here; one that fits nowhere is a sign that it does two things.
 ORDER = (
-    *("errors", "cluster", "pose", "scan", "record", "reference", "protocol", "journey"),
+    *("errors", "progress", "cluster", "pose", "scan", "record", "reference"),
+    *("protocol", "journey"),
     *("array_file", "_jit"),
     *("angle_function", "segments", "anchors", "graph"),
     *("length_relation", "oriented_relation", "database", "alignment"),

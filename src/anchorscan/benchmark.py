@@ -41,6 +41,7 @@ from .io import open_log
 from .karto_matcher import KartoMatcher
 from .matcher import Matcher
 from .pose import Pose2D
+from .progress import ProgressOf
 from .protocol import Answer, Split, revisit, sparse, thin, two_sessions, unknown_place
 from .record import Record
 from .reference import Reference
@@ -126,14 +127,6 @@ class Answering(Protocol):
 
 
 Locate = Callable[[LaserScan], Sequence[Answering]]
-
-
-class ProgressOf(Protocol):
-    """How the caller shows progress: passes items on."""
-
-    def __call__(
-        self, items: Iterable[Item], what: str, total: int | None = None
-    ) -> Iterable[Item]: ...
 
 
 @dataclass(frozen=True, eq=False)

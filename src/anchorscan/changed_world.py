@@ -28,6 +28,7 @@ from .drawing import LIGHT, require_matplotlib
 from .errors import AnchorscanError, MissingExtraError
 from .matcher import Matcher
 from .pose import Pose2D
+from .progress import ProgressOf
 from .protocol import Answer, thin, two_sessions
 from .record import Record
 from .reference import Reference
@@ -68,14 +69,6 @@ _PUSH = 2.0
 # Nearer to a surface than this, metres, there is no room for a robot any more.
 _ROOM = 0.2
 _WANTED = 0.995
-
-
-class ProgressOf(Protocol):
-    """How the caller shows progress: passes items on."""
-
-    def __call__(
-        self, items: Iterable[Item], what: str, total: int | None = None
-    ) -> Iterable[Item]: ...
 
 
 class Case(Protocol):

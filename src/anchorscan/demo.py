@@ -10,10 +10,10 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +22,7 @@ from .errors import MissingExtraError
 from .hypothesis import Hypothesis
 from .io import open_log
 from .pose import Pose2D
+from .progress import ProgressOf
 from .protocol import Answer, Figures, Split, figures, revisit
 from .record import Record
 from .reference_set import ReferenceSet
@@ -44,14 +45,6 @@ _MARGIN = 4.0
 _NOSE = 1.5
 _CUT = 2.0
 _ASPECT = 1.35
-
-
-class ProgressOf(Protocol):
-    """How the caller shows progress: passes items on."""
-
-    def __call__(
-        self, items: Iterable[int], what: str, total: int | None = None
-    ) -> Iterable[int]: ...
 
 
 @dataclass(frozen=True, eq=False)

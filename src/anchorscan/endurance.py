@@ -17,10 +17,10 @@ import gc
 import math
 import sys
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol, TypeVar
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -28,6 +28,7 @@ from numpy.typing import ArrayLike
 from .errors import AnchorscanError
 from .localizer import Localizer
 from .pose import Pose2D
+from .progress import ProgressOf
 from .protocol import CORRECT_HEADING, CORRECT_POSITION
 from .record import Record
 from .reference_set import ReferenceSet
@@ -42,14 +43,6 @@ _SECONDS = 3600.0
 _FEWEST_LAPS = 4
 # So many standard errors above zero are a growth.
 _SURE = 3.0
-
-
-class ProgressOf(Protocol):
-    """How the caller shows progress: passes items on."""
-
-    def __call__(
-        self, items: Iterable[Item], what: str, total: int | None = None
-    ) -> Iterable[Item]: ...
 
 
 @dataclass(frozen=True)

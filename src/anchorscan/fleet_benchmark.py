@@ -28,6 +28,7 @@ from .decision import DecisionSettings, covariance, evidence, held
 from .errors import AnchorscanError
 from .fleet import LOOK_ALIKES, TWINS, BuildingFits, Fleet, no_twin, ranked, search
 from .pose import Pose2D
+from .progress import ProgressOf
 from .protocol import CORRECT_HEADING, CORRECT_POSITION, recall_at_precision, reliability, thin
 from .reference import Reference
 from .reference_set import ReferenceSet
@@ -51,14 +52,6 @@ _SCORE = FEATURES.index("score")
 _TWIN_AT = Pose2D(1000.0, -500.0, 1.0)
 _UNKNOWN_WEIGHT = 0.3
 _TRIED = np.arange(0.0, 2.01, 0.05)
-
-
-class ProgressOf(Protocol):
-    """How the caller shows progress: passes items on."""
-
-    def __call__(
-        self, items: Iterable[Item], what: str, total: int | None = None
-    ) -> Iterable[Item]: ...
 
 
 class Case(Protocol):

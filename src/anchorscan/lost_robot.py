@@ -24,7 +24,7 @@ from __future__ import annotations
 import json
 import math
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -36,6 +36,7 @@ from .localizer import Belief, Localizer
 from .matcher import Matcher
 from .monte_carlo import MonteCarlo
 from .pose import Pose2D
+from .progress import ProgressOf
 from .protocol import Answer, choose_references, thin
 from .record import Record
 from .reference import Reference
@@ -69,14 +70,6 @@ class Follower(Protocol):
     """What keeps a belief over time."""
 
     def update(self, scan: LaserScan, odometry: Pose2D | None, stamp: float | None) -> Belief: ...
-
-
-class ProgressOf(Protocol):
-    """How the caller shows progress: passes items on."""
-
-    def __call__(
-        self, items: Iterable[Item], what: str, total: int | None = None
-    ) -> Iterable[Item]: ...
 
 
 Prepare = Callable[[Sequence[Reference]], Callable[[], Follower]]

@@ -19,7 +19,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol, TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +30,7 @@ from .io import Log
 from .map_file import load_map
 from .occupancy import MAP_SENSOR, OccupancyGrid, reference_scans
 from .pose import Pose2D
+from .progress import ProgressOf
 from .record import Record
 from .reference_set import ReferenceSet
 from .scan import LaserScan
@@ -52,14 +53,6 @@ _PICTURE = "map-check.png"
 _ON_TRACK, _OFF_TRACK, _UNSURE = "#0072b2", "#d55e00", "#cc79a7"
 _FAINT = "#8a8a8a"
 _FRAME = 1.5
-
-
-class ProgressOf(Protocol):
-    """How the caller shows progress: passes items on."""
-
-    def __call__(
-        self, items: Iterable[Item], what: str, total: int | None = None
-    ) -> Iterable[Item]: ...
 
 
 @dataclass(frozen=True, eq=False)

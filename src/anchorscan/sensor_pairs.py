@@ -13,13 +13,14 @@ full turn that sees 12 m, turns clockwise and loses one reading in ten.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol, TypeVar
+from typing import TypeVar
 
 from .building import random_building
 from .matcher import Matcher
 from .pose import Pose2D
+from .progress import ProgressOf
 from .protocol import Answer, figures, thin, two_sessions
 from .record import Record
 from .reference import Reference
@@ -54,14 +55,6 @@ _CHANGED = 0.3
 _LENGTH = 120.0
 
 Item = TypeVar("Item")
-
-
-class ProgressOf(Protocol):
-    """How the caller shows progress: passes items on."""
-
-    def __call__(
-        self, items: Iterable[Item], what: str, total: int | None = None
-    ) -> Iterable[Item]: ...
 
 
 @dataclass(frozen=True)

@@ -12,15 +12,16 @@ them (figures in the documentation); they make them less sure.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Literal, Protocol, TypeVar
+from typing import Literal, TypeVar
 
 import numpy as np
 
 from .errors import ReferenceSetError
 from .matcher import Matcher
 from .pose import Pose2D
+from .progress import ProgressOf
 from .reference import Reference
 from .reference_set import ReferenceSet
 from .verification import FEATURES
@@ -37,14 +38,6 @@ _AWAY, _TURNED = 0.5, math.radians(20.0)
 _CLEARLY_BETTER = 0.2
 _TOO_FEW_NEAR = 0.6
 _UNSEEN = 0.5
-
-
-class ProgressOf(Protocol):
-    """How the caller shows progress: passes items on."""
-
-    def __call__(
-        self, items: Iterable[Item], what: str, total: int | None = None
-    ) -> Iterable[Item]: ...
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,7 +15,7 @@ the place is in that map.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol, TypeVar
 
@@ -23,6 +23,7 @@ import numpy as np
 
 from .plausibility import Plausibility, mirror_check, mirror_image
 from .pose import Pose2D
+from .progress import ProgressOf
 from .protocol import CORRECT_HEADING, CORRECT_POSITION, Split, thin
 from .record import Record
 from .reference_set import ReferenceSet
@@ -41,14 +42,6 @@ _COLUMNS = (
     *("place", "queries", "as they are", "mirrored", "said", "5 % misplaced", "named", "false"),
     *("map 5 % large", "map twice as large", "mm", "degrees"),
 )
-
-
-class ProgressOf(Protocol):
-    """How the caller shows progress: passes items on."""
-
-    def __call__(
-        self, items: Iterable[Item], what: str, total: int | None = None
-    ) -> Iterable[Item]: ...
 
 
 class Drive(Protocol):
