@@ -156,13 +156,14 @@ def room():
     return scans, LikelihoodField(DEFAULT, scans)
 
 
-def plain_scores(tiles, points, at, weights):
+def plain_scores(tiles, readings, at, weights):
     total = 0.0
-    for x, y in Pose2D(*at).apply(points).tolist():
+    ends = Pose2D(*at).apply(readings[:, :2]).tolist()
+    for (x, y), row in zip(ends, readings[:, 2].astype(int), strict=True):
         total += weights[
-            code_at(tiles, math.floor(x / tiles.resolution), math.floor(y / tiles.resolution))
+            row, code_at(tiles, math.floor(x / tiles.resolution), math.floor(y / tiles.resolution))
         ]
-    return total / len(points)
+    return total / len(readings)
 
 
 @given(seeds)
@@ -171,10 +172,10 @@ def test_scores_are_the_twins(room, seed):
     rng = np.random.default_rng(seed)
     tiles, weights = room[1].tiles, DEFAULT.weights()
     at = rng.uniform((-8.0, -8.0, -4.0), (8.0, 8.0, 4.0), (3, 3))
-    points = rng.uniform(-6.0, 6.0, (20, 2))
-    expected = [plain_scores(tiles, points, each, weights) for each in at.tolist()]
-    np.testing.assert_allclose(field_scores(at, points, tiles, weights), expected, atol=1e-6)
-    assert field_scores(at, np.empty((0, 2)), tiles, weights).tolist() == [0.0] * 3
+    readings = np.column_stack((rng.uniform(-6.0, 6.0, (20, 2)), rng.integers(0, 2, 20)))
+    expected = [plain_scores(tiles, readings, each, weights) for each in at.tolist()]
+    np.testing.assert_allclose(field_scores(at, readings, tiles, weights), expected, atol=1e-6)
+    assert field_scores(at, np.empty((0, 3)), tiles, weights).tolist() == [0.0] * 3
 
 
 @pytest.mark.interpreted
@@ -183,7 +184,7 @@ def test_a_coarse_cell_has_the_best_score_of_its_cells():
     scan = drawn(walls, sensor=SPARSE)
     limits = FieldSettings(resolution=0.2, reach=0.5)
     tiles = LikelihoodField(limits, [(scan, Pose2D(0.3, 0.2))]).tiles
-    weights = limits.weights()
+    weights = limits.weights()[0]
     for row in range(16 * tiles.height):
         for column in range(16 * tiles.width):
             best = max(
@@ -206,8 +207,8 @@ def test_beyond_the_table_nothing_is_known(room):
 
 def test_weights_fall_with_the_distance_and_more_so_in_free_space():
     for limits in (DEFAULT, COARSE, FieldSettings(), FieldSettings(sharpness=0.2)):
-        weights = limits.weights()
-        assert weights.shape == (256,)
+        weights, small = limits.weights()
+        assert weights.shape == small.shape == (256,)
         unknown, free = weights[: FAR + 1], weights[FREE : FREE + FAR + 1]
         assert unknown[0] == free[0] == 1.0
         assert np.all(np.diff(unknown) <= 0.0)
@@ -215,6 +216,10 @@ def test_weights_fall_with_the_distance_and_more_so_in_free_space():
         assert np.all(free <= unknown)
         assert unknown[FAR] == pytest.approx(limits.unknown_score)
         assert free[FAR] == pytest.approx(-limits.free_penalty)
+        # A small thing may be new where nothing was, and only there.
+        assert np.all(small >= weights)
+        assert small[FREE + FAR] == pytest.approx(limits.blocked_score)
+        np.testing.assert_array_equal(small[: FAR + 1], unknown)
         # Whether the cell itself is a surface makes no difference to who ends near one.
         np.testing.assert_array_equal(weights[SURFACE:], weights[:SURFACE])
 

@@ -12,7 +12,7 @@ from scans import box, drawn, reversed_sweep, scans, seen_in_building, sweeps, w
 
 from anchorscan import LaserScan
 from anchorscan.angle_function import CONNECTED, AngleFunctionSettings, angle_function
-from anchorscan.segments import SegmentSettings, segments
+from anchorscan.segments import SegmentSettings, is_small, segments
 
 SURFACES = AngleFunctionSettings()
 PRESETS = [SegmentSettings(), SegmentSettings(smallest_extent=0.2, fewest_readings=2)]
@@ -84,3 +84,15 @@ def test_the_sense_of_rotation_does_not_matter(scan):
 def test_a_scan_with_nothing_to_tell_has_no_large_surface(ranges):
     scan = LaserScan.from_field_of_view(ranges, math.pi)
     assert len(segments(angle_function(scan, SURFACES), PRESETS[1])) == 0
+
+
+@given(wild_scans(), st.floats(0.01, 5.0))
+def test_small_things_are_runs_that_are_short_along_their_way(scan, extent):
+    angles = angle_function(scan, SURFACES)
+    expected, run = [], []
+    for i in range(len(angles.ranges)):
+        run.append(i)
+        if i + 1 == len(angles.ranges) or angles.gaps[i] != CONNECTED:
+            expected += [angles.way[run[-1]] - angles.way[run[0]] < extent] * len(run)
+            run = []
+    assert is_small(angles, extent).tolist() == expected

@@ -22,7 +22,7 @@ WEIGHTS = FIELD.weights()
 LIMITS = VerificationSettings()
 SMALL = VerificationSettings(third_poses=6, fits=4, iterations=2, rays=8)
 SCORE, THROUGH = FEATURES.index("score"), FEATURES.index("through")
-NOBODY = np.empty((0, 2))
+NOBODY = np.empty((0, 3))
 
 
 @pytest.fixture(scope="module")
@@ -44,6 +44,12 @@ def around(pose, rng, count):
     return pose.to_array() + size * rng.normal(0.0, (1.0, 1.0, 0.3), (count, 3))
 
 
+def mixed(scan):
+    """The readings of a scan, every fifth as if on a small thing."""
+    points = scan.points
+    return np.column_stack((points, np.arange(len(points)) % 5 == 0))
+
+
 # The twins.
 
 
@@ -52,18 +58,24 @@ def plain_codes(pose, points, tiles):
     return [int(cell_code(tiles, cx - tiles.column, cy - tiles.row)) for cx, cy in cells.tolist()]
 
 
-def plain_score(pose, points, tiles):
-    return float(np.mean([float(WEIGHTS[code]) for code in plain_codes(pose, points, tiles)]))
+def plain_scores(pose, readings, tiles):
+    """A small thing loses nothing in free space but what it does not gain."""
+    codes = plain_codes(pose, readings[:, :2], tiles)
+    return [float(WEIGHTS[int(r), c]) for r, c in zip(readings[:, 2], codes, strict=True)]
 
 
-def plain_features(pose, points, tiles):
+def plain_score(pose, readings, tiles):
+    return float(np.mean(plain_scores(pose, readings, tiles)))
+
+
+def plain_features(pose, readings, tiles):
     """Shares by the names of ``FEATURES``, but for the rays."""
-    codes = np.array(plain_codes(pose, points, tiles))
+    codes = np.array(plain_codes(pose, readings[:, :2], tiles))
     distance = (codes & 63) / 63 * tiles.reach
     is_free = (codes & 64) > 0
     is_far = (codes & 63) == 63
     shares = {
-        "score": WEIGHTS.astype(float)[codes],
+        "score": plain_scores(pose, readings, tiles),
         "near": distance <= 0.1,
         "close": distance <= 0.2,
         "free": is_far & is_free,
@@ -91,9 +103,9 @@ def plain_distinct(poses, distance, turn, most):
     return chosen
 
 
-def plain_best(poses, points, readings, tiles):
+def plain_best(poses, points, most, tiles):
     """Poses by their score with so many readings, best first, equals as they came."""
-    few = spread(points, readings)
+    few = spread(points, most)
     return sorted(poses.tolist(), key=lambda pose: -plain_score(pose, few, tiles))
 
 
@@ -133,7 +145,7 @@ def test_a_few_poses_go_through_the_sieves_as_the_twins_say(mapped):
     tiles, asked = mapped
     scan, pose = asked[0]
     poses = around(pose, np.random.default_rng(3), 9)
-    check_against_twin(poses, scan.points, tiles, SMALL)
+    check_against_twin(poses, mixed(scan), tiles, SMALL)
 
 
 @given(seeds, st.sampled_from([LIMITS, SMALL]), st.integers(1, 80))
@@ -141,7 +153,7 @@ def test_a_few_poses_go_through_the_sieves_as_the_twins_say(mapped):
 def test_poses_go_through_the_sieves_as_the_twins_say(mapped, seed, limits, count):
     tiles, asked = mapped
     scan, pose = asked[seed % len(asked)]
-    check_against_twin(around(pose, np.random.default_rng(seed), count), scan.points, tiles, limits)
+    check_against_twin(around(pose, np.random.default_rng(seed), count), mixed(scan), tiles, limits)
 
 
 @given(seeds, st.integers(0, 30), st.integers(1, 8))
@@ -181,7 +193,7 @@ def test_the_truth_comes_out_on_top(mapped):
         wrong = [around(other, rng, 12) for _, other in asked]
         near = pose @ Pose2D(0.15, -0.1, 0.05)
         poses = np.concatenate([*wrong, near.to_array()[np.newaxis]])
-        fits = verify(poses, scan.points, tiles, WEIGHTS, LIMITS)
+        fits = verify(poses, mixed(scan), tiles, WEIGHTS, LIMITS)
         best = Pose2D(*fits.poses[0])
         errors.append((best.distance(pose), best.turn(pose)))
     # Here and there a place is seen from one side only and holds a pose less well.
@@ -196,7 +208,7 @@ def test_fits_are_in_order_and_apart(mapped):
         poses = np.concatenate(
             [around(other, rng, 12) for _, other in asked] + [around(pose, rng, 40)]
         )
-        fits = verify(poses, scan.points, tiles, WEIGHTS, LIMITS)
+        fits = verify(poses, mixed(scan), tiles, WEIGHTS, LIMITS)
         assert 1 <= len(fits) <= LIMITS.fits
         worths = [worth(*pair) for pair in fits.features[:, [SCORE, THROUGH]].tolist()]
         assert np.all(np.diff(worths) <= 0.0)
@@ -216,8 +228,8 @@ def test_the_order_of_the_proposals_does_not_matter(mapped, seed):
     rng = np.random.default_rng(seed)
     scan, pose = asked[seed % len(asked)]
     poses = around(pose, rng, 30)
-    ours = verify(poses, scan.points, tiles, WEIGHTS, LIMITS)
-    theirs = verify(rng.permutation(poses), scan.points, tiles, WEIGHTS, LIMITS)
+    ours = verify(poses, mixed(scan), tiles, WEIGHTS, LIMITS)
+    theirs = verify(rng.permutation(poses), mixed(scan), tiles, WEIGHTS, LIMITS)
     # Poses that explain equally little stay in the order in which they came.
     np.testing.assert_array_equal(ours.poses[0], theirs.poses[0])
     np.testing.assert_array_equal(ours.features[0], theirs.features[0])
@@ -229,9 +241,9 @@ def test_more_effort_finds_no_worse_a_fit(mapped):
     rng = np.random.default_rng(5)
     for scan, pose in asked[:6]:
         poses = around(pose, rng, 60)
-        ours = verify(poses, scan.points, tiles, WEIGHTS, LIMITS)
-        theirs = verify(poses, scan.points, tiles, WEIGHTS, thorough)
-        few = spread(scan.points, 120)
+        ours = verify(poses, mixed(scan), tiles, WEIGHTS, LIMITS)
+        theirs = verify(poses, mixed(scan), tiles, WEIGHTS, thorough)
+        few = spread(mixed(scan), 120)
         scores = field_scores(np.stack([ours.poses[0], theirs.poses[0]]), few, tiles, WEIGHTS)
         assert scores[1] > scores[0] - 0.03
 
@@ -241,13 +253,15 @@ def test_more_effort_finds_no_worse_a_fit(mapped):
 
 @pytest.mark.interpreted
 def test_no_poses_have_no_fits(mapped):
-    fits = verify(np.empty((0, 3)), mapped[1][0][0].points, mapped[0], WEIGHTS, LIMITS)
+    fits = verify(np.empty((0, 3)), mixed(mapped[1][0][0]), mapped[0], WEIGHTS, LIMITS)
     assert len(fits) == 0
     assert fits.poses.shape == (0, 3)
     assert fits.features.shape == (0, len(FEATURES))
 
 
-@pytest.mark.parametrize("points", [NOBODY, np.array([[1.0, 0.5]]), np.full((5, 2), 1e6)])
+@pytest.mark.parametrize(
+    "points", [NOBODY, np.array([[1.0, 0.5, 0.0]]), np.full((5, 3), (1e6, 1e6, 1.0))]
+)
 def test_a_scan_of_little_has_a_fit_that_tells_little(mapped, points):
     poses = mapped[1][0][1].to_array()[np.newaxis]
     fits = verify(poses, points, mapped[0], WEIGHTS, LIMITS)
@@ -260,7 +274,7 @@ def test_a_scan_of_little_has_a_fit_that_tells_little(mapped, points):
 def test_a_map_of_nothing_explains_nothing(mapped):
     nothing = LikelihoodField(FIELD).tiles
     scan, pose = mapped[1][0]
-    fits = verify(pose.to_array()[np.newaxis], scan.points, nothing, WEIGHTS, LIMITS)
+    fits = verify(pose.to_array()[np.newaxis], mixed(scan), nothing, WEIGHTS, LIMITS)
     assert fits.features[0, FEATURES.index("unknown")] == 1.0
     assert fits.features[0, SCORE] == pytest.approx(FIELD.unknown_score)
     np.testing.assert_allclose(fits.poses[0], pose.to_array())

@@ -1140,15 +1140,17 @@ def calibrate(
     scored = calibration.rotate(samples, settings.decision.threshold)
     for fit in (fit for fit in scored if fit.protocol != "P4"):
         typer.echo(
-            f"{fit.protocol} {fit.place}: {fit.queries} queries, recall {fit.recall:.3f} at 100 % "
-            f"and {fit.recall_99:.3f} at 99 % precision, calibration error "
+            f"{fit.protocol} {fit.place}, {fit.crowd:.0%} occluded: {fit.queries} queries, "
+            f"recall {fit.recall:.3f} at 100 % and {fit.recall_99:.3f} at 99 % precision, calibration error "
             f"{fit.calibration_error:.3f}, {fit.accepted_wrong} of {fit.accepted} answers wrong"
         )
     unknown = [fit for fit in scored if fit.protocol == "P4"]
-    typer.echo(
-        f"P4, {len(unknown)} pairs of buildings: {sum(fit.accepted for fit in unknown)} of "
-        f"{sum(fit.queries for fit in unknown)} queries answered"
-    )
+    for crowd in sorted({fit.crowd for fit in unknown}):
+        pairs = [fit for fit in unknown if fit.crowd == crowd]
+        typer.echo(
+            f"P4, {len(pairs)} pairs of buildings, {crowd:.0%} occluded: "
+            f"{sum(fit.accepted for fit in pairs)} of {sum(fit.queries for fit in pairs)} answered"
+        )
     typer.echo(json.dumps({"decision": calibration.weigh(samples)}, indent=2))
 
 

@@ -295,7 +295,9 @@ def _codes(tiles: Tiles, points: NDArray[np.float64]) -> NDArray[np.uint8]:
     poses = np.zeros((len(points), 3))
     poses[:, :2] = points
     itself = np.arange(256, dtype=np.float32)
-    return np.asarray(field_scores(poses, np.zeros((1, 2)), tiles, itself)).astype(np.uint8)
+    return np.asarray(field_scores(poses, np.zeros((1, 3)), tiles, itself[np.newaxis])).astype(
+        np.uint8
+    )
 
 
 def wall_points(references: Iterable[Reference], cell: float = 0.05) -> NDArray[np.float64]:

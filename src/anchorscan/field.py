@@ -88,16 +88,26 @@ class FieldSettings(BaseModel):
         0.05, ge=0.0, le=1.0, description="score of a reading that ends where nobody looked"
     )
     free_penalty: float = Field(0.7, ge=0.0, description="score lost in known free space")
+    blocked_score: float = Field(
+        0.6, ge=0.0, le=1.0, description="score there of a small thing, which may be a person"
+    )
 
     def weights(self) -> NDArray[np.float32]:
-        """(256,) score of a reading by the byte of the cell in which it ends."""
+        """(2, 256) score of a reading by the byte of the cell in which it ends.
+
+        The second row is for readings on small things.  What is small may be new: where the
+        map knows free space it is hardly taken against a pose, since it may stand before the
+        surface that was there, and elsewhere it counts as any other reading.
+        """
         code = np.arange(256)
         distance = (code & _FAR) * self.reach / _FAR
         score = np.maximum(self.unknown_score, 1.0 - distance / self.sharpness)
         near, far = 0.5 * self.sharpness, 0.75 * self.sharpness
         fall = np.interp(distance, (near, far), (0.5, -self.free_penalty))
-        score = np.where(((code & _FREE) > 0) & (distance > near), fall, score)
-        return score.astype(np.float32)
+        is_free = ((code & _FREE) > 0) & (distance > near)
+        score = np.where(is_free, fall, score)
+        small = np.where(is_free, np.maximum(score, self.blocked_score), score)
+        return np.stack((score, small)).astype(np.float32)
 
 
 class Tiles(NamedTuple):
@@ -169,7 +179,7 @@ class LikelihoodField:
         unknown = np.full((1, _SIDE * _SIDE), _FAR, np.uint8)
         coarse = np.zeros((1, (_SIDE // _COARSE) ** 2), np.int8)
         everything = np.full((1, 2), _ALL_BLOCKS, np.uint64)
-        _pool(np.zeros(1, np.int32), everything, unknown, coarse, settings.weights())
+        _pool(np.zeros(1, np.int32), everything, unknown, coarse, settings.weights()[0])
         self._begin(settings, TileEvidence(), unknown, coarse, 1)
         stale: set[tuple[int, int]] = set()
         for rays in self._batches(scans):
@@ -214,7 +224,7 @@ class LikelihoodField:
         used: int,
     ) -> None:
         self._settings = settings
-        self._weights = settings.weights()
+        self._weights = settings.weights()[0]
         self._evidence = evidence
         self._pages = np.zeros((1, 1), np.int32)
         self._corner = (0, 0)  # of the pages, counted in pages
@@ -632,8 +642,11 @@ def coarse_score(tiles, cx, cy):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def field_scores(poses, points, tiles, weights):  # type: ignore[no-untyped-def]
-    """(P,) mean score of (N, 2) points (scan frame) at each of (P, 3) poses."""
+def field_scores(poses, readings, tiles, weights):  # type: ignore[no-untyped-def]
+    """(P,) mean score of readings (scan frame) at each of (P, 3) poses.
+
+    Readings are (N, 3): x, y and the row of the weights that is theirs.
+    """
     scores = np.empty(len(poses))
     scale = 1.0 / tiles.resolution
     for p in range(len(poses)):
@@ -642,11 +655,11 @@ def field_scores(poses, points, tiles, weights):  # type: ignore[no-untyped-def]
         x = poses[p, 0] * scale - tiles.column
         y = poses[p, 1] * scale - tiles.row
         total = 0.0
-        for i in range(len(points)):
-            cx = int(x + c * points[i, 0] - s * points[i, 1])
-            cy = int(y + s * points[i, 0] + c * points[i, 1])
-            total += weights[cell_code(tiles, cx, cy)]
-        scores[p] = total / max(len(points), 1)
+        for i in range(len(readings)):
+            cx = int(x + c * readings[i, 0] - s * readings[i, 1])
+            cy = int(y + s * readings[i, 0] + c * readings[i, 1])
+            total += weights[int(readings[i, 2]), cell_code(tiles, cx, cy)]
+        scores[p] = total / max(len(readings), 1)
     return scores
 
 

@@ -48,7 +48,7 @@ from .reference import Reference
 from .scan import LaserScan
 from .settings import Settings
 from .simulator import SensorModel, random_building, random_poses, simulate
-from .verification import verify
+from .verification import readings, verify
 
 __all__ = ["RANKS", "SIZES", "Growth", "Place", "Scene", "Size", "distractors", "measure", "slope"]
 
@@ -313,10 +313,12 @@ class _Asked:
         """Say whether the search ends at the truth when only some references propose."""
         if not some:
             return False
-        points, settings = description.angles.points, self._settings
+        settings = self._settings
+        seen = readings(description.angles, settings.verification)
+        large = seen[seen[:, 2] == 0.0]
         related = joined([self._landmarks[number] for number in some])
-        proposed = proposals(description.anchors, points, related, self._tiles, settings.proposal)
-        fits = verify(proposed.poses, points, self._tiles, self._weights, settings.verification)
+        proposed = proposals(description.anchors, large, related, self._tiles, settings.proposal)
+        fits = verify(proposed.poses, seen, self._tiles, self._weights, settings.verification)
         if not len(fits):
             return False
         found = Pose2D(*fits.poses[0].tolist())

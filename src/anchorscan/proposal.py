@@ -310,7 +310,7 @@ def proposals(
 
     Args:
         anchors: Of the scan.
-        points: (N, 2) end points of the scan's returns, metres, scan frame.
+        points: (N, 2) end points of the returns to check with, metres, scan frame.
         known: Landmarks of the references, all of them or several lots.
         tiles: The map stitched from them.
         settings: Of the search.
@@ -340,13 +340,13 @@ def proposals(
 
 @kernel
 def spread(points, most):  # type: ignore[no-untyped-def]
-    """At most ``most`` of (N, 2) points, evenly over the readings."""
+    """At most ``most`` of (N, K) points, evenly over the readings."""
     count = min(len(points), most)
-    chosen = np.empty((count, 2))
+    chosen = np.empty((count, points.shape[1]))
     for k in range(count):
         i = ((2 * k + 1) * len(points)) // (2 * count)
-        chosen[k, 0] = points[i, 0]
-        chosen[k, 1] = points[i, 1]
+        for j in range(points.shape[1]):
+            chosen[k, j] = points[i, j]
     return chosen
 
 

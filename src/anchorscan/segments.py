@@ -17,7 +17,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from ._jit import kernel
 from .angle_function import AngleFunction
 
-__all__ = ["SegmentSettings", "Segments", "segments"]
+__all__ = ["SegmentSettings", "Segments", "is_small", "segments"]
 
 
 class SegmentSettings(BaseModel):
@@ -51,6 +51,31 @@ def segments(angles: AngleFunction, settings: SegmentSettings) -> Segments:
         angles.runs, angles.way, settings.smallest_extent, settings.fewest_readings
     )
     return Segments(first, last)
+
+
+def is_small(angles: AngleFunction, extent: float) -> NDArray[np.bool_]:
+    """Tell which returns lie on things along which the way is shorter than ``extent``.
+
+    A thing is a run of returns without a gap, whatever its number of readings: a person, the leg
+    of a table, a single reading out of place.
+
+    Returns:
+        (V,) for every return.
+    """
+    small: NDArray[np.bool_] = _is_small(angles.runs, angles.way, extent)
+    return small
+
+
+@kernel
+def _is_small(runs, way, extent):  # type: ignore[no-untyped-def]
+    """Whether the run of each return is shorter than an extent."""
+    small = np.empty(len(runs), np.bool_)
+    last = len(runs) - 1
+    for i in range(len(runs) - 1, -1, -1):
+        if i + 1 < len(runs) and runs[i + 1] != runs[i]:
+            last = i
+        small[i] = way[last] - way[runs[i]] < extent
+    return small
 
 
 @kernel

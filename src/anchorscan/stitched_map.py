@@ -40,7 +40,7 @@ from .proposal import (
 from .reference import Reference
 from .scan import LaserScan
 from .settings import Settings
-from .verification import Fits, follow, verify
+from .verification import Fits, follow, readings, verify
 
 __all__ = ["MapSearch", "StitchedMap"]
 
@@ -246,13 +246,14 @@ class StitchedMap:
         """
         settings, content = self._settings, self._content
         tiles = content.tiles
-        points = description.angles.points
+        seen = readings(description.angles, settings.verification)
+        large = seen[seen[:, 2] == 0.0]
         votes = None if most is None else self._voting().votes(description.graph, most)
         related = content.landmarks if votes is None else self._some(votes.references, content)
-        proposed = proposals(description.anchors, points, related, tiles, settings.proposal)
+        proposed = proposals(description.anchors, large, related, tiles, settings.proposal)
         if not len(proposed.poses):
             proposed = _standing(content)
-        fits = verify(proposed.poses, points, tiles, self._weights, settings.verification)
+        fits = verify(proposed.poses, seen, tiles, self._weights, settings.verification)
         decision = decide(fits, len(description.anchors), settings.decision)
         hypotheses, known = self._hypotheses(description, fits, decision, content)
         references = tuple(each.reference for each in known)

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
 from ._jit import kernel
-from .angle_function import wrapped
+from .angle_function import AngleFunction, wrapped
 from .field import (
     Tiles,
     _solved,
@@ -37,13 +37,16 @@ from .field import (
     refined,
 )
 from .proposal import spread
+from .segments import is_small
 
-__all__ = ["FEATURES", "Fits", "VerificationSettings", "follow", "verify", "worth"]
+__all__ = ["FEATURES", "Fits", "VerificationSettings", "follow", "readings", "verify", "worth"]
 
 # What is told of every fit: shares of the readings.
 FEATURES = ("score", "near", "close", "free", "unknown", "through", "off")
 # Scores above this are one: what is left is noise.
 _LARGEST_SCORE = 0.995
+# With fewer readings on large surfaces than this, and than this share, all count as such.
+_FEWEST_LARGE, _SMALLEST_SHARE = 20, 0.25
 
 
 class VerificationSettings(BaseModel):
@@ -64,6 +67,9 @@ class VerificationSettings(BaseModel):
     place_distance: float = Field(0.5, gt=0.0, description="fits nearer are one place, metres")
     place_turn: float = Field(
         math.radians(20.0), gt=0.0, description="fits turned less are one place, radians"
+    )
+    small_extent: float = Field(
+        0.8, ge=0.0, description="way along things that may have come or gone, metres"
     )
     last_readings: int = Field(120, ge=4, description="readings of the last numbers")
     rays: int = Field(45, ge=4, description="rays followed through the map")
@@ -103,9 +109,24 @@ class Fits:
         )
 
 
+def readings(angles: AngleFunction, settings: VerificationSettings) -> NDArray[np.float64]:
+    """Return (N, 3) the returns of a scan: x, y (metres, scan frame), and 1 on small things.
+
+    The paper takes its anchor points from large surfaces only, since these are what stays.  So
+    it is with readings: a person, a chair or a stray reading may stand where the map knows
+    free space, a wall may not.  A scan that shows hardly anything large has to go by what
+    it shows.
+    """
+    small = is_small(angles, settings.small_extent)
+    large = len(small) - int(np.count_nonzero(small))
+    if large < _FEWEST_LARGE or large < _SMALLEST_SHARE * len(small):
+        small = np.zeros(len(small), np.bool_)
+    return np.column_stack((angles.points, small))
+
+
 def verify(
     poses: NDArray[np.float64],
-    points: NDArray[np.float64],
+    readings: NDArray[np.float64],
     tiles: Tiles,
     weights: NDArray[np.float32],
     settings: VerificationSettings,
@@ -114,9 +135,9 @@ def verify(
 
     Args:
         poses: T_set_laser, metres and radians.
-        points: (N, 2) end points of the scan's returns, metres, scan frame.
+        readings: (N, 3) of the scan, see ``readings``.
         tiles: The stitched map.
-        weights: (256,) score of a reading by the byte of its cell.
+        weights: (2, 256) score of a reading by the byte of its cell, on large and small things.
         settings: Of the sieves.
     """
     sieves = (
@@ -127,14 +148,14 @@ def verify(
         settings.distinct_distance,
         settings.distinct_turn,
     )
-    chosen = _sieve(poses, points, tiles, weights, sieves)
+    chosen = _sieve(poses, readings, tiles, weights, sieves)
     places = (settings.place_distance, settings.place_turn)
     rays = (settings.rays, settings.through_margin)
     steps = (settings.fit_readings, settings.iterations, settings.last_readings)
-    readings = min(len(points), settings.last_readings)
-    found = _fit(chosen, points, tiles, weights, steps, places, rays)
+    found = _fit(chosen, readings, tiles, weights, steps, places, rays)
     poses, features, hessians, residuals = found
-    return Fits(poses, features, hessians, residuals, readings)
+    count = min(len(readings), settings.last_readings)
+    return Fits(poses, features, hessians, residuals, count)
 
 
 def follow(
@@ -164,10 +185,11 @@ def follow(
     """
     steps = (settings.fit_readings, settings.iterations, settings.last_readings)
     rays = (settings.rays, settings.through_margin)
-    found = _follow(poses, stiffness, points, tiles, weights, steps, rays)
+    alike = np.column_stack((points, np.zeros(len(points))))
+    found = _follow(poses, stiffness, alike, tiles, weights[np.newaxis], steps, rays)
     moved, features, hessians, residuals = found
-    readings = min(len(points), settings.last_readings)
-    return Fits(moved, features, hessians, residuals, readings)
+    count = min(len(points), settings.last_readings)
+    return Fits(moved, features, hessians, residuals, count)
 
 
 @kernel
@@ -177,13 +199,13 @@ def worth(score, through):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _sieve(poses, points, tiles, weights, sieves):  # type: ignore[no-untyped-def]
+def _sieve(poses, readings, tiles, weights, sieves):  # type: ignore[no-untyped-def]
     """The best distinct poses by more and more readings."""
     second, third, most, fits, distance, turn = sieves
-    scores = field_scores(poses, spread(points, second), tiles, weights)
+    scores = field_scores(poses, spread(readings, second), tiles, weights)
     order = np.argsort(-scores, kind="mergesort")[:most]
     best = poses[order]
-    scores = field_scores(best, spread(points, third), tiles, weights)
+    scores = field_scores(best, spread(readings, third), tiles, weights)
     best = best[np.argsort(-scores, kind="mergesort")]
     return best[_distinct(best, distance, turn, fits)]
 
@@ -209,40 +231,40 @@ def _distinct(poses, distance, turn, most):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _features(pose, points, tiles, weights, numbers):  # type: ignore[no-untyped-def]
+def _features(pose, readings, tiles, weights, numbers):  # type: ignore[no-untyped-def]
     """The numbers of ``FEATURES`` for one pose, but for the rays."""
     numbers[:] = 0.0
     c, s = math.cos(pose[2]) / tiles.resolution, math.sin(pose[2]) / tiles.resolution
     x = pose[0] / tiles.resolution - tiles.column
     y = pose[1] / tiles.resolution - tiles.row
-    for i in range(len(points)):
+    for i in range(len(readings)):
         code = cell_code(
             tiles,
-            int(x + c * points[i, 0] - s * points[i, 1]),
-            int(y + s * points[i, 0] + c * points[i, 1]),
+            int(x + c * readings[i, 0] - s * readings[i, 1]),
+            int(y + s * readings[i, 0] + c * readings[i, 1]),
         )
         distance = (code & 63) * tiles.reach / 63.0
         free = (code & 64) > 0
-        numbers[0] += weights[code]
+        numbers[0] += weights[int(readings[i, 2]), code]
         numbers[1] += distance <= 0.1
         numbers[2] += distance <= 0.2
         if distance >= tiles.reach:
             numbers[3 if free else 4] += 1
         elif distance > 0.2 and free:
             numbers[6] += 1
-    numbers /= max(len(points), 1)
+    numbers /= max(len(readings), 1)
 
 
 @kernel
-def _fit(poses, points, tiles, weights, steps, places, rays):  # type: ignore[no-untyped-def]
+def _fit(poses, readings, tiles, weights, steps, places, rays):  # type: ignore[no-untyped-def]
     """Refine every pose and take the numbers of each place, of the highest worth first."""
     count = len(poses)
     moved = np.empty((count, 3))
     features = np.empty((count, 7))
     worths = np.empty(count)
-    few = spread(points, steps[0])
-    many = spread(points, steps[2])
-    followed = spread(points, rays[0])
+    few = spread(readings, steps[0])
+    many = spread(readings, steps[2])
+    followed = spread(readings, rays[0])
     for k in range(count):
         moved[k] = refined(poses[k], few, tiles, steps[1])
         moved[k, 2] = wrapped(moved[k, 2])
@@ -262,16 +284,16 @@ def _fit(poses, points, tiles, weights, steps, places, rays):  # type: ignore[no
 
 
 @kernel
-def _follow(poses, stiffness, points, tiles, weights, steps, rays):  # type: ignore[no-untyped-def]
+def _follow(poses, stiffness, readings, tiles, weights, steps, rays):  # type: ignore[no-untyped-def]
     """Refine every expected pose and take all its numbers."""
     count = len(poses)
     moved = np.empty((count, 3))
     features = np.empty((count, 7))
     hessians = np.empty((count, 3, 3))
     residuals = np.empty(count)
-    few = spread(points, steps[0])
-    many = spread(points, steps[2])
-    followed = spread(points, rays[0])
+    few = spread(readings, steps[0])
+    many = spread(readings, steps[2])
+    followed = spread(readings, rays[0])
     for k in range(count):
         moved[k] = _held_back(poses[k], stiffness[k], few, tiles, steps[1])
         _features(moved[k], many, tiles, weights, features[k])
