@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import functools
 import importlib
 import json
 import subprocess
@@ -80,16 +81,17 @@ def modules() -> list[str]:
     return sorted(path.stem for path in PACKAGE.glob("*.py") if path.stem != "__init__")
 
 
-def imports(path: Path, *, only_at_import: bool = False) -> set[tuple[int, str]]:
+@functools.cache
+def imports(path: Path, *, only_at_import: bool = False) -> frozenset[tuple[int, str]]:
     """Give (level, first name) of every relative import of a file."""
     tree = ast.parse(path.read_text(encoding="utf-8"))
     nodes = ast.iter_child_nodes(tree) if only_at_import else ast.walk(tree)
-    found = set()
+    found: set[tuple[int, str]] = set()
     for node in nodes:
         if isinstance(node, ast.ImportFrom) and node.level:
             names = [node.module] if node.module else [alias.name for alias in node.names]
             found |= {(node.level, str(name).split(".")[0]) for name in names}
-    return found
+    return frozenset(found)
 
 
 def test_every_file_has_a_place() -> None:
