@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import functools
 import importlib
 import json
 import subprocess
@@ -14,6 +15,7 @@ import pytest
 import anchorscan
 
 PACKAGE = Path(anchorscan.__file__).parent
+COMMANDS = PACKAGE / "commands"
 ROOT = PACKAGE.parents[1]
 
 # In the order of the data flow: a file imports only files that stand before it.  A new file
@@ -68,6 +70,7 @@ LEAVES = {
         "wrong_data",
         "ros_node",
         "cli",
+        "commands",
     ),
     "__main__",
 }
@@ -78,16 +81,17 @@ def modules() -> list[str]:
     return sorted(path.stem for path in PACKAGE.glob("*.py") if path.stem != "__init__")
 
 
-def imports(path: Path, *, only_at_import: bool = False) -> set[tuple[int, str]]:
+@functools.cache
+def imports(path: Path, *, only_at_import: bool = False) -> frozenset[tuple[int, str]]:
     """Give (level, first name) of every relative import of a file."""
     tree = ast.parse(path.read_text(encoding="utf-8"))
     nodes = ast.iter_child_nodes(tree) if only_at_import else ast.walk(tree)
-    found = set()
+    found: set[tuple[int, str]] = set()
     for node in nodes:
         if isinstance(node, ast.ImportFrom) and node.level:
             names = [node.module] if node.module else [alias.name for alias in node.names]
             found |= {(node.level, str(name).split(".")[0]) for name in names}
-    return found
+    return frozenset(found)
 
 
 def test_every_file_has_a_place() -> None:
@@ -103,17 +107,27 @@ def test_a_file_imports_only_what_stands_before_it(module: str) -> None:
         assert name in before or name == "io", f"{module} must not import {name}"
 
 
-@pytest.mark.parametrize("module", sorted(LEAVES & set(modules())))
+@pytest.mark.parametrize("module", sorted(LEAVES & {*modules(), "commands"}))
 def test_leaves_are_imported_by_nobody_but_the_command_line(module: str) -> None:
     for path in PACKAGE.rglob("*.py"):
-        if path.stem in {"cli", "__main__"}:
+        if path.stem in {"cli", "__main__"} or path.parent == COMMANDS:
             continue
-        assert (1, module) not in imports(path), f"{path.stem} imports the leaf {module}"
+        depth = len(path.relative_to(PACKAGE).parts)
+        assert (depth, module) not in imports(path), f"{path.stem} imports the leaf {module}"
 
 
 def test_the_command_line_loads_no_leaf_before_a_command_asks_for_it() -> None:
     at_import = {name for _, name in imports(PACKAGE / "cli.py", only_at_import=True)}
-    assert at_import <= {"__version__", "errors"}
+    assert at_import <= {"__version__", "commands"}
+    for path in COMMANDS.glob("*.py"):
+        loaded = {name for level, name in imports(path, only_at_import=True) if level == 2}
+        assert loaded <= {"errors"}, f"commands/{path.name} loads {sorted(loaded)}"
+
+
+def test_commands_share_what_is_said_read_and_told_and_nothing_else() -> None:
+    for path in COMMANDS.glob("*.py"):
+        siblings = {name for level, name in imports(path) if level == 1}
+        assert siblings <= {"console", "logs", "options"}, f"commands/{path.name}"
 
 
 def test_readers_import_only_values() -> None:

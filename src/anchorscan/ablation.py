@@ -15,10 +15,10 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,14 +27,12 @@ from .anchors import AnchorSettings
 from .errors import AnchorscanError
 from .matcher import Matcher
 from .pose import Pose2D
-from .protocol import Answer, recall_at_precision, thin
-from .reference import Reference
+from .protocol import Answer, Case, recall_at_precision, thin
 from .scan import LaserScan
 from .settings import Settings
 
 __all__ = [
     "CHANGES",
-    "Case",
     "Change",
     "Outcome",
     "attempt",
@@ -48,26 +46,6 @@ _PRECISION = 0.99
 _NO_CHANGE = "no change"
 _TURN = math.radians(360.0)
 _EIGHTH = math.radians(45.0)
-
-
-class Case(Protocol):
-    """A split to be measured."""
-
-    @property
-    def protocol(self) -> str:
-        """P1, P2 or P3."""
-
-    @property
-    def looks_alike(self) -> bool:
-        """Whether no single scan can be sure there."""
-
-    @property
-    def references(self) -> Sequence[Reference]:
-        """The references, with poses."""
-
-    @property
-    def queries(self) -> Iterator[tuple[LaserScan, Pose2D | None]]:
-        """Scans, each with its true pose."""
 
 
 @dataclass(frozen=True)

@@ -48,7 +48,7 @@ from ._jit import kernel
 from .angle_function import wrapped
 from .field import FieldSettings
 from .motion import Motion, MotionSettings
-from .verification import FEATURES, Fits
+from .verification import FEATURES, LARGEST_SCORE, Fits
 
 __all__ = [
     "BeliefSettings",
@@ -67,7 +67,6 @@ __all__ = [
 _SCORE, _CLOSE, _FREE, _UNKNOWN, _THROUGH = (
     FEATURES.index(name) for name in ("score", "close", "free", "unknown", "through")
 )
-_LARGEST_SCORE = 0.995
 _SMALLEST_SHARE = 0.05
 _NEVER = -1e3  # logarithm of a weight that is none, finite so that differences are
 
@@ -264,7 +263,7 @@ def log_odds(fits: Fits, settings: BeliefSettings) -> NDArray[np.float64]:
 
 def _excess(score: NDArray[np.float64], elsewhere: float) -> NDArray[np.float64]:
     """Logarithm of how much less a score leaves unexplained than the rest of the world."""
-    rest = 1.0 - np.clip(score, 0.0, _LARGEST_SCORE)
+    rest = 1.0 - np.clip(score, 0.0, LARGEST_SCORE)
     return math.log(1.0 - elsewhere) - np.log(rest)
 
 

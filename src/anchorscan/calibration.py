@@ -17,7 +17,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,43 +24,17 @@ from numpy.typing import NDArray
 from .decision import evidence
 from .matcher import Matcher
 from .pose import Pose2D
-from .protocol import CORRECT_HEADING, CORRECT_POSITION, recall_at_precision, reliability
-from .reference import Reference
-from .scan import LaserScan
+from .protocol import CORRECT_HEADING, CORRECT_POSITION, Case, recall_at_precision, reliability
 from .settings import Settings
 from .simulator import occlude
 
-__all__ = ["Case", "Fit", "Sample", "fit", "gather", "rotate", "weigh"]
+__all__ = ["Fit", "Sample", "fit", "gather", "rotate", "weigh"]
 
 _PROTOCOL_WEIGHTS = {"P1": 1.0, "P2": 0.5, "P3": 1.0, "P4": 0.03}
 _RIDGE = 0.02
 _CROWDS = (0.0, 0.1, 0.2)
 _STEPS = 50
 _COEFFICIENTS = ("constant", "log_margin", "explained", "through", "heading", "anchors")
-
-
-class Case(Protocol):
-    """A split to take evidence from."""
-
-    @property
-    def protocol(self) -> str:
-        """P1, P2, P3 or P4."""
-
-    @property
-    def place(self) -> str:
-        """What tables call it."""
-
-    @property
-    def buildings(self) -> tuple[str, ...]:
-        """Of the references and of the queries."""
-
-    @property
-    def references(self) -> Sequence[Reference]:
-        """The references, with poses."""
-
-    @property
-    def queries(self) -> Iterable[tuple[LaserScan, Pose2D | None]]:
-        """Scans, each with its true pose; None in an unknown place."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,7 +19,7 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol, TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
@@ -29,7 +29,7 @@ from .errors import AnchorscanError, MissingExtraError
 from .matcher import Matcher
 from .pose import Pose2D
 from .progress import ProgressOf
-from .protocol import Answer, thin, two_sessions
+from .protocol import Answer, Case, thin, two_sessions
 from .record import Record
 from .reference import Reference
 from .scan import LaserScan
@@ -44,7 +44,6 @@ if TYPE_CHECKING:
 __all__ = [
     "AMOUNTS",
     "CHANGES",
-    "Case",
     "Outcome",
     "changed",
     "draw",
@@ -69,22 +68,6 @@ _PUSH = 2.0
 # Nearer to a surface than this, metres, there is no room for a robot any more.
 _ROOM = 0.2
 _WANTED = 0.995
-
-
-class Case(Protocol):
-    """A split of recorded drives."""
-
-    @property
-    def place(self) -> str:
-        """What tables call it."""
-
-    @property
-    def references(self) -> Sequence[Reference]:
-        """The references, with poses."""
-
-    @property
-    def queries(self) -> Iterator[tuple[LaserScan, Pose2D | None]]:
-        """Scans, each with its true pose."""
 
 
 @dataclass(frozen=True)

@@ -45,12 +45,12 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
 from ._jit import kernel
-from .verification import FEATURES, Fits, worth
+from .verification import FEATURES, LARGEST_SCORE, Fits, worth
 
 __all__ = ["Decision", "DecisionSettings", "covariance", "decide", "evidence", "held", "worths"]
 
 _SCORE, _THROUGH = FEATURES.index("score"), FEATURES.index("through")
-_SMALLEST_MARGIN, _LARGEST_SCORE = 0.003, 0.995
+_SMALLEST_MARGIN = 0.003
 _MANY_READINGS, _LUCKY_READINGS = 120, 10.0
 _CORRECT_POSITION, _CORRECT_HEADING = 0.5, math.radians(10.0)
 
@@ -123,7 +123,7 @@ def evidence(fits: Fits, anchors: int) -> NDArray[np.float64]:
     if len(fits) > 1:
         rival = float(fits.features[1, _SCORE]), float(fits.features[1, _THROUGH])
     margin = max(worth(score, through) - worth(*rival), _SMALLEST_MARGIN)
-    rest = 1.0 - min(score, _LARGEST_SCORE)
+    rest = 1.0 - min(score, LARGEST_SCORE)
     rest += _LUCKY_READINGS * max(0.0, 1.0 / max(fits.readings, 1) - 1.0 / _MANY_READINGS)
     return np.array(
         [

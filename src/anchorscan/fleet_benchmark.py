@@ -16,9 +16,9 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Protocol, TypeVar
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,8 +29,14 @@ from .errors import AnchorscanError
 from .fleet import LOOK_ALIKES, TWINS, BuildingFits, Fleet, no_twin, ranked, search
 from .pose import Pose2D
 from .progress import ProgressOf
-from .protocol import CORRECT_HEADING, CORRECT_POSITION, recall_at_precision, reliability, thin
-from .reference import Reference
+from .protocol import (
+    CORRECT_HEADING,
+    CORRECT_POSITION,
+    Case,
+    recall_at_precision,
+    reliability,
+    thin,
+)
 from .reference_set import ReferenceSet
 from .scan import LaserScan
 from .sensor import SensorModel
@@ -39,7 +45,7 @@ from .simulator import drive, random_poses, simulate
 from .verification import FEATURES
 from .world import World, move_furniture, turn_doors
 
-__all__ = ["Asked", "Case", "Outcome", "fitted", "log_loss", "outcomes", "run", "table", "twins"]
+__all__ = ["Asked", "Outcome", "fitted", "log_loss", "outcomes", "run", "table", "twins"]
 
 Item = TypeVar("Item")
 
@@ -52,22 +58,6 @@ _SCORE = FEATURES.index("score")
 _TWIN_AT = Pose2D(1000.0, -500.0, 1.0)
 _UNKNOWN_WEIGHT = 0.3
 _TRIED = np.arange(0.0, 2.01, 0.05)
-
-
-class Case(Protocol):
-    """A building with a set and with scans of a later visit."""
-
-    @property
-    def place(self) -> str:
-        """What tables call it."""
-
-    @property
-    def references(self) -> Sequence[Reference]:
-        """The references, with poses."""
-
-    @property
-    def queries(self) -> Iterable[tuple[LaserScan, Pose2D | None]]:
-        """Scans, each with its true pose."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -36,7 +36,7 @@ from .belief import (
 from .decision import held
 from .hypothesis import Hypothesis
 from .matcher import _ROOM, Candidates, Matcher, Trace
-from .motion import Motion, motion
+from .motion import Motion, Odometer
 from .pose import Pose2D
 from .record import Record
 from .reference import Reference
@@ -126,8 +126,7 @@ class Localizer:
     def reset(self) -> None:
         """Know nothing."""
         self._mixture = nothing_known()
-        self._odometry: Pose2D | None = None
-        self._stamp: float | None = None
+        self._odometer = Odometer(self._settings.motion)
         self._recent: deque[Record] = deque(maxlen=_KEPT)
         self._since_search = math.inf
         self._belief = Belief((), 1.0, False)
@@ -157,7 +156,7 @@ class Localizer:
             What is believed now.
         """
         settings = self._settings
-        step = self._step(odometry, stamp)
+        step = self._odometer.step(odometry, stamp)
         self._remember(scan, step)
         if not scan.is_return.any():
             self._mixture = moved(self._mixture, step, settings)
@@ -173,13 +172,6 @@ class Localizer:
         self._mixture = mixture
         return self._report()
 
-    def _step(self, odometry: Pose2D | None, stamp: float | None) -> Motion:
-        elapsed = None if stamp is None or self._stamp is None else stamp - self._stamp
-        step = motion(self._odometry, odometry, elapsed, self._settings.motion)
-        self._odometry = odometry if odometry is None or odometry.is_finite() else None
-        self._stamp = stamp if stamp is None or math.isfinite(stamp) else None
-        return step
-
     def _is_due(self, step: Motion) -> bool:
         """Whether the whole map is to be searched for this scan."""
         settings = self._settings
@@ -192,17 +184,17 @@ class Localizer:
 
     def _remember(self, scan: LaserScan, step: Motion) -> None:
         """Keep the scan for the window if the robot went on a bit; what went before a gap goes."""
-        if self._window <= 0.0 or self._odometry is None:
+        if self._window <= 0.0 or self._odometer.latest is None:
             return
         if not step.measured:
             self._recent.clear()
         kept = self._recent[-1].odometry if self._recent else None
-        if kept is None or kept.distance(self._odometry) >= self._window / _KEPT:
-            self._recent.append(Record(0, scan, odometry=self._odometry))
+        if kept is None or kept.distance(self._odometer.latest) >= self._window / _KEPT:
+            self._recent.append(Record(0, scan, odometry=self._odometer.latest))
 
     def _search(self, scan: LaserScan) -> NDArray[np.float64]:
-        if self._recent and self._odometry is not None:
-            latest = Record(0, scan, odometry=self._odometry)
+        if self._recent and self._odometer.latest is not None:
+            latest = Record(0, scan, odometry=self._odometer.latest)
             scan = joined_scan([*self._recent, latest], self._window)
         in_map = self._places.explain(scan).in_map
         return np.empty((0, 3)) if in_map is None else in_map.fits.poses

@@ -17,7 +17,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from .pose import Pose2D
 
-__all__ = ["Motion", "MotionSettings", "motion"]
+__all__ = ["Motion", "MotionSettings", "Odometer", "motion"]
 
 
 class MotionSettings(BaseModel):
@@ -95,3 +95,29 @@ def motion(
 
 def _diagonal(position: float, heading: float) -> NDArray[np.float64]:
     return np.diag(np.square((position, position, heading)))
+
+
+class Odometer:
+    """Tells of every scan how the robot moved since the one before.
+
+    Args:
+        settings: How far to trust odometry.
+    """
+
+    def __init__(self, settings: MotionSettings) -> None:
+        self._settings = settings
+        self.latest: Pose2D | None = None
+        self._stamp: float | None = None
+
+    def step(self, odometry: Pose2D | None, stamp: float | None) -> Motion:
+        """Return the step to the next scan; what is not finite is taken for unknown.
+
+        Args:
+            odometry: ``T_odom_laser``, where known.
+            stamp: Seconds on any clock, where known.
+        """
+        elapsed = None if stamp is None or self._stamp is None else stamp - self._stamp
+        step = motion(self.latest, odometry, elapsed, self._settings)
+        self.latest = odometry if odometry is None or odometry.is_finite() else None
+        self._stamp = stamp if stamp is None or math.isfinite(stamp) else None
+        return step

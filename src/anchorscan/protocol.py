@@ -18,17 +18,21 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .pose import Pose2D
 from .record import Record
+from .reference import Reference
+from .scan import LaserScan
 
 __all__ = [
     "CORRECT_HEADING",
     "CORRECT_POSITION",
     "Answer",
+    "Case",
     "Figures",
     "Reliability",
     "Split",
@@ -72,6 +76,34 @@ class Split:
     queries: tuple[int, ...]
     spacing: float = _SPACING
     heading: float = _HEADING
+
+
+class Case(Protocol):
+    """A place to be measured: what is known of it, and what is asked."""
+
+    @property
+    def protocol(self) -> str:
+        """P1, P2, P3 or P4."""
+
+    @property
+    def place(self) -> str:
+        """What tables call it."""
+
+    @property
+    def buildings(self) -> tuple[str, ...]:
+        """Of the references and of the queries."""
+
+    @property
+    def looks_alike(self) -> bool:
+        """Whether no single scan can be sure there."""
+
+    @property
+    def references(self) -> Sequence[Reference]:
+        """The references, with poses."""
+
+    @property
+    def queries(self) -> Iterable[tuple[LaserScan, Pose2D | None]]:
+        """Scans, each with its true pose; None in an unknown place."""
 
 
 @dataclass(frozen=True, eq=False)

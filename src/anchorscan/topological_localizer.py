@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
 from .matcher import Candidates, Trace
-from .motion import Motion, MotionSettings, motion
+from .motion import MotionSettings, Odometer
 from .pose import Pose2D
 from .reference import Reference
 from .scan import LaserScan
@@ -133,8 +133,7 @@ class TopologicalLocalizer:
         count = len(self._identifiers)
         self._belief = np.full(count + 1, 0.5 / max(count, 1))
         self._belief[-1] = 0.5 if count else 1.0
-        self._odometry: Pose2D | None = None
-        self._stamp: float | None = None
+        self._odometer = Odometer(self._settings.motion)
 
     def update(
         self, scan: LaserScan, odometry: Pose2D | None = None, stamp: float | None = None
@@ -150,7 +149,7 @@ class TopologicalLocalizer:
             What is believed now.
         """
         settings = self._settings
-        step = self._step(odometry, stamp)
+        step = self._odometer.step(odometry, stamp)
         belief = left(self._belief, self._pairs, step.driven, settings)
         fits, poses = self._fits(scan)
         if fits is not None:
@@ -171,13 +170,6 @@ class TopologicalLocalizer:
             if one != other:
                 pairs.append(sorted((self._index[one], self._index[other])))
         return np.array(sorted({tuple(pair) for pair in pairs}), np.int64).reshape(-1, 2)
-
-    def _step(self, odometry: Pose2D | None, stamp: float | None) -> Motion:
-        elapsed = None if stamp is None or self._stamp is None else stamp - self._stamp
-        step = motion(self._odometry, odometry, elapsed, self._settings.motion)
-        self._odometry = odometry if odometry is None or odometry.is_finite() else None
-        self._stamp = stamp if stamp is None or math.isfinite(stamp) else None
-        return step
 
     def _fits(self, scan: LaserScan) -> tuple[NDArray[np.float64] | None, dict[int, Pose2D]]:
         """Return the best e_m with every reference, and the alignments that gave them."""

@@ -39,12 +39,21 @@ from .field import (
 from .proposal import spread
 from .segments import is_small
 
-__all__ = ["FEATURES", "Fits", "VerificationSettings", "follow", "readings", "verify", "worth"]
+__all__ = [
+    "FEATURES",
+    "LARGEST_SCORE",
+    "Fits",
+    "VerificationSettings",
+    "follow",
+    "readings",
+    "verify",
+    "worth",
+]
 
 # What is told of every fit: shares of the readings.
 FEATURES = ("score", "near", "close", "free", "unknown", "through", "off")
 # Scores above this are one: what is left is noise.
-_LARGEST_SCORE = 0.995
+LARGEST_SCORE = 0.995
 # With fewer readings on large surfaces than this, and than this share, all count as such.
 _FEWEST_LARGE, _SMALLEST_SHARE = 20, 0.25
 
@@ -195,7 +204,7 @@ def follow(
 @kernel
 def worth(score, through):  # type: ignore[no-untyped-def]
     """What fits are ordered by, of a score and the share of rays that pass through surfaces."""
-    return -math.log(1.0 - min(score, _LARGEST_SCORE)) - math.sqrt(through)
+    return -math.log(1.0 - min(score, LARGEST_SCORE)) - math.sqrt(through)
 
 
 @kernel

@@ -24,7 +24,7 @@ import numpy as np
 from .plausibility import Plausibility, mirror_check, mirror_image
 from .pose import Pose2D
 from .progress import ProgressOf
-from .protocol import CORRECT_HEADING, CORRECT_POSITION, Split, thin
+from .protocol import CORRECT_HEADING, CORRECT_POSITION, Case, Split, thin
 from .record import Record
 from .reference_set import ReferenceSet
 from .scan import LaserScan
@@ -52,16 +52,8 @@ class Drive(Protocol):
         """Its records, in order."""
 
 
-class Case(Protocol):
-    """Scans of a place that is known."""
-
-    @property
-    def protocol(self) -> str:
-        """How they were chosen."""
-
-    @property
-    def place(self) -> str:
-        """What tables call it."""
+class SplitCase(Case, Protocol):
+    """A case with the drives that it was made of."""
 
     @property
     def known(self) -> Drive:
@@ -89,7 +81,7 @@ class Told:
 
 
 def run(
-    tasks: Sequence[Case],
+    tasks: Sequence[SplitCase],
     settings: Settings,
     queries: int,
     seed: int,
@@ -140,7 +132,7 @@ def displaced(
     return moved, chosen
 
 
-def _row(task: Case, settings: Settings, queries: int, seed: int) -> list[object]:
+def _row(task: SplitCase, settings: Settings, queries: int, seed: int) -> list[object]:
     known = [task.known.records[position] for position in task.split.references]
     asked = [task.asked.records[position] for position in thin(task.split.queries, queries, seed)]
     places = _set(known, settings)

@@ -1,0 +1,327 @@
+"""``locate``, ``which`` and ``track``: where the scans of a log were taken, a line of JSON each."""
+
+from __future__ import annotations
+
+import signal
+import time
+from collections import deque
+from collections.abc import Iterable, Iterator
+from itertools import islice
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from ..errors import LogError
+from .console import say, write_lines
+from .logs import records_shown, refuse_mirrored
+from .options import (
+    CandidatesOption,
+    LinesOption,
+    LogArgument,
+    LogOptions,
+    ProcessesOption,
+    SetArgument,
+    SettingsOptions,
+)
+
+if TYPE_CHECKING:
+    from ..fleet import Fleet
+    from ..hypothesis import Hypothesis
+    from ..io import Log
+    from ..pose import Pose2D
+    from ..record import Record
+    from ..reference_set import ReferenceSet
+    from ..settings import Settings
+
+__all__ = ["locate", "track", "which"]
+
+# Digits that a user can use: a micrometre, a microradian, and six of a covariance.
+_DECIMALS = 6
+# Scans that a worker process takes at once, and how many such lots may wait for it.
+_CHUNK = 16
+_CHUNKS_AHEAD = 4
+
+
+def locate(
+    set_file: SetArgument,
+    log: LogArgument,
+    candidates: CandidatesOption = None,
+    output: LinesOption = None,
+    processes: ProcessesOption = 1,
+    *,
+    reading: LogOptions,
+    settings: SettingsOptions,
+) -> None:
+    """Say where every scan of a log was taken, each on its own, with no prior.
+
+    One JSON object a scan, in the order of the log, hypotheses best first; the poses are those
+    of the laser in the frame of the set, in metres and radians.
+    """
+    opened = reading.open(log)
+    chosen = settings.read()
+    records = records_shown(opened, "locating", output)
+    accepted = unusable = count = 0
+    lines = _located(records, set_file, chosen, candidates, processes, opened)
+    for line in write_lines(lines, output):
+        count += 1
+        accepted += line["accepted"]
+        unusable += "reason" in line
+    say(
+        f"{log}: {count} scans: {accepted} located, {count - accepted - unusable} not known, "
+        f"{unusable} unusable"
+    )
+
+
+def which(
+    sets: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="SET... LOG", help="Reference sets, or folders of them; then a log."
+        ),
+    ],
+    output: LinesOption = None,
+    threads: Annotated[
+        int, typer.Option(min=1, metavar="N", help="Share the sets among threads.")
+    ] = 1,
+    *,
+    reading: LogOptions,
+    settings: SettingsOptions,
+) -> None:
+    """Say in which of many buildings every scan of a log was taken, and where in it.
+
+    One JSON object a scan, as of locate; every hypothesis names its building: the file of its set
+    without ".apr". A probability is that the building and the pose are right, among all sets.
+    """
+    from ..fleet import Fleet
+
+    *places, log = sets
+    if not places:
+        raise typer.BadParameter("give reference sets, and a log after them")
+    opened = reading.open(log)
+    fleet = Fleet.open(places, settings=settings.read())
+    fleet.prepare()
+    records = records_shown(opened, "asking", output)
+    accepted: dict[str, int] = {}
+    count = 0
+    lines = (_which_line(fleet, record, threads) for record in records)
+    for line in write_lines(lines, output):
+        count += 1
+        if line["accepted"]:
+            building = line["hypotheses"][0]["building"]
+            accepted[building] = accepted.get(building, 0) + 1
+    told = ", ".join(f"{number} in {name}" for name, number in sorted(accepted.items()))
+    say(f"{log}: {count} scans, {len(fleet)} sets: {told or 'none located'}")
+
+
+def track(
+    set_file: SetArgument,
+    log: LogArgument,
+    output: LinesOption = None,
+    tum: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE", help="Write where the robot was located as a TUM trajectory, too."
+        ),
+    ] = None,
+    window: Annotated[
+        float,
+        typer.Option(
+            min=0.0,
+            metavar="M",
+            help="Search with the scans of the latest M metres joined into a view all around.",
+        ),
+    ] = 0.0,
+    *,
+    reading: LogOptions,
+    settings: SettingsOptions,
+) -> None:
+    """Follow a robot through a log: scans and odometry in order, with no prior.
+
+    One JSON object a scan; "accepted" says whether the robot is located. The poses are those
+    of the laser in the frame of the set, in metres and radians.
+    """
+    from ..io import write_tum
+
+    opened = reading.open(log)
+    chosen = settings.read()
+    records = records_shown(opened, "tracking", output)
+    accepted = count = 0
+    trajectory: list[tuple[float, Pose2D]] = []
+    lines = _tracked(records, set_file, chosen, opened, window)
+    for line in write_lines(lines, output):
+        count += 1
+        accepted += line["accepted"]
+        if line["accepted"] and line["stamp"] is not None:
+            trajectory.append((line["stamp"], _pose_of(line)))
+    say(f"{log}: {count} scans: located after {accepted}, not known after {count - accepted}")
+    if tum is not None:
+        if accepted and not trajectory:
+            raise LogError("has no times, and a trajectory in TUM format needs them", log)
+        say(f"{tum}: {write_tum(tum, trajectory)} poses")
+
+
+class _Locator:
+    """Locates records in an opened set; one for every process."""
+
+    def __init__(self, set_file: Path, settings: Settings | None, candidates: Any) -> None:
+        from ..reference_set import ReferenceSet
+
+        self.places: ReferenceSet = ReferenceSet.open(set_file, settings=settings)
+        self._candidates = candidates
+        self.places.prepare()
+
+    def line(self, record: Record) -> dict[str, Any]:
+        """Return the line of ``locate`` for a record."""
+        hypotheses: list[Hypothesis] = []
+        start = time.perf_counter()
+        if record.scan is not None:
+            hypotheses = self.places.locate(record.scan, self._candidates)
+        seconds = time.perf_counter() - start
+        line: dict[str, Any] = {
+            "scan": record.index,
+            "stamp": record.stamp,
+            "seconds": round(seconds, _DECIMALS + 1),
+            "accepted": bool(hypotheses) and hypotheses[0].accepted,
+            "hypotheses": [_hypothesis_line(hypothesis) for hypothesis in hypotheses],
+        }
+        if not hypotheses:
+            line["reason"] = self._reason(record)
+        return line
+
+    def _reason(self, record: Record) -> str:
+        if record.scan is None:
+            return record.problem
+        return "no reading is a return" if len(self.places) else "the set has no references"
+
+
+def _located(
+    records: Iterable[Record],
+    set_file: Path,
+    settings: Settings | None,
+    candidates: Any,
+    processes: int,
+    log: Log,
+) -> Iterator[dict[str, Any]]:
+    """Yield the lines of ``locate`` in the order of the records."""
+    locator = _Locator(set_file, settings, candidates)
+    refuse_mirrored(locator.places, log)
+    if processes == 1:
+        yield from map(locator.line, records)
+        return
+    import multiprocessing
+    from concurrent.futures import Future, ProcessPoolExecutor
+
+    # The kernels are compiled by now, and the others load them from numba's cache.
+    del locator
+    # Spawned, because the thread that draws the progress must not be forked.
+    with ProcessPoolExecutor(
+        processes,
+        multiprocessing.get_context("spawn"),
+        _start_worker,
+        (set_file, settings, candidates),
+    ) as pool:
+        pending: deque[Future[list[dict[str, Any]]]] = deque()
+        remaining = iter(records)
+        for chunk in iter(lambda: list(islice(remaining, _CHUNK)), []):
+            pending.append(pool.submit(_work, chunk))
+            if len(pending) > _CHUNKS_AHEAD * processes:
+                yield from pending.popleft().result()
+        for future in pending:
+            yield from future.result()
+
+
+_worker: _Locator | None = None
+
+
+def _start_worker(set_file: Path, settings: Settings | None, candidates: Any) -> None:
+    global _worker  # noqa: PLW0603 - a worker process holds nothing else
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent is told, and ends the workers
+    _worker = _Locator(set_file, settings, candidates)
+
+
+def _work(records: list[Record]) -> list[dict[str, Any]]:
+    assert _worker is not None
+    return [_worker.line(record) for record in records]
+
+
+def _which_line(fleet: Fleet, record: Record, threads: int) -> dict[str, Any]:
+    """Return the line of ``which`` for a record."""
+    start = time.perf_counter()
+    found = [] if record.scan is None else fleet.locate(record.scan, threads)
+    line: dict[str, Any] = {
+        "scan": record.index,
+        "stamp": record.stamp,
+        "seconds": round(time.perf_counter() - start, _DECIMALS + 1),
+        "accepted": bool(found) and found[0].hypothesis.accepted,
+        "hypotheses": [
+            {"building": each.building, **_hypothesis_line(each.hypothesis)} for each in found
+        ],
+    }
+    if not found:
+        line["reason"] = record.problem or "no reading is a return"
+    return line
+
+
+def _tracked(
+    records: Iterable[Record],
+    set_file: Path,
+    settings: Settings | None,
+    log: Log,
+    window: float,
+) -> Iterator[dict[str, Any]]:
+    """Yield the line of ``track`` for every record."""
+    from ..localizer import Localizer
+    from ..reference_set import ReferenceSet
+
+    places = ReferenceSet.open(set_file, settings=settings)
+    places.prepare()
+    refuse_mirrored(places, log)
+    localizer = Localizer(places, window)
+    localizer.prepare()
+    for record in records:
+        line: dict[str, Any] = {"scan": record.index, "stamp": record.stamp}
+        if record.scan is None:
+            yield {**line, "seconds": 0.0, "accepted": False, "reason": record.problem}
+            continue
+        start = time.perf_counter()
+        belief = localizer.update(record.scan, record.odometry, record.stamp)
+        line["seconds"] = round(time.perf_counter() - start, _DECIMALS + 1)
+        line["accepted"] = bool(belief.accepted)
+        line |= _pose_line(belief.pose)
+        spread = belief.covariance
+        line["covariance"] = (
+            None if spread is None else [[_significant(value) for value in row] for row in spread]
+        )
+        line["probability"] = round(belief.probability, _DECIMALS)
+        line["state"] = belief.state
+        yield line
+
+
+def _hypothesis_line(hypothesis: Hypothesis) -> dict[str, Any]:
+    return {
+        "reference": hypothesis.reference,
+        **_pose_line(hypothesis.pose),
+        "covariance": [[_significant(value) for value in row] for row in hypothesis.covariance],
+        "evaluation": round(hypothesis.evaluation, _DECIMALS),
+        "quality": round(hypothesis.quality, _DECIMALS),
+        "probability": round(hypothesis.probability, _DECIMALS),
+        "score": _significant(hypothesis.score),
+        "pose_in_reference": _pose_line(hypothesis.pose_in_reference),
+    }
+
+
+def _pose_line(pose: Pose2D | None) -> dict[str, float | None]:
+    if pose is None:  # the set has no common frame
+        return {"x": None, "y": None, "theta": None}
+    return {name: round(getattr(pose, name), _DECIMALS) for name in ("x", "y", "theta")}
+
+
+def _pose_of(line: dict[str, Any]) -> Pose2D:
+    from ..pose import Pose2D
+
+    return Pose2D(line["x"], line["y"], line["theta"])
+
+
+def _significant(value: float) -> float:
+    return float(f"{value:.{_DECIMALS}g}")

@@ -1,0 +1,129 @@
+"""What every command tells: results whole, messages and progress on stderr, errors in one line."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import sys
+import time
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from functools import wraps
+from pathlib import Path
+from typing import Any, TextIO, TypeVar
+
+import typer
+
+from ..errors import AnchorscanError, LogError
+
+__all__ = ["FAILED", "guarded", "progress", "say", "write_lines"]
+
+Command = TypeVar("Command", bound=Callable[..., None])
+Item = TypeVar("Item")
+
+FAILED = 1
+_PROGRESS_DELAY = 1.0
+_PROGRESS_INTERVAL = 0.1
+
+
+def guarded(command: Command) -> Command:
+    """End known errors as one line, and an interrupted or unread run without a word."""
+
+    @wraps(command)
+    def guarded(*args: Any, **kwargs: Any) -> None:
+        try:
+            command(*args, **kwargs)
+            sys.stdout.flush()
+        except AnchorscanError as error:
+            say(f"error: {error}")
+            raise typer.Exit(FAILED) from None
+        except BrokenPipeError:
+            # Whoever read us (head, less) has seen enough; what is buffered has no reader.
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            raise typer.Exit(128 + signal.SIGPIPE) from None
+        except KeyboardInterrupt:
+            raise typer.Exit(128 + signal.SIGINT) from None
+        except OSError as error:
+            if error.filename is None and error.errno is None:
+                raise
+            place = "" if error.filename is None else f"{error.filename}: "
+            say(f"error: {place}{error.strerror}")
+            raise typer.Exit(FAILED) from None
+
+    return guarded  # type: ignore[return-value]
+
+
+def say(message: str) -> None:
+    """Tell the user something that is no result."""
+    typer.echo(message, err=True)
+
+
+def write_lines(lines: Iterable[dict[str, Any]], path: Path | None) -> Iterator[dict[str, Any]]:
+    """Write lines of JSON as they come, to stdout or to a file, and pass them on."""
+    with _writing(path) as stream:
+        for line in lines:
+            stream.write(json.dumps(line, allow_nan=False) + "\n")
+            stream.flush()
+            yield line
+
+
+@contextmanager
+def _writing(path: Path | None) -> Iterator[TextIO]:
+    """Give a stream to stdout or to a file that appears only when it is whole."""
+    if path is None:
+        yield sys.stdout
+        return
+    target = path.resolve()
+    if target.exists() and not target.is_file():  # a pipe or a device is written, not replaced
+        with target.open("w", encoding="utf-8") as stream:
+            yield stream
+        return
+    draft = target.with_name(f".{target.name}.{os.getpid()}.part")
+    try:
+        with draft.open("w", encoding="utf-8") as stream:
+            yield stream
+        draft.replace(target)
+    except OSError as error:
+        if isinstance(error, BrokenPipeError):
+            raise
+        raise LogError(f"cannot be written: {error.strerror}", path) from None
+    finally:
+        draft.unlink(missing_ok=True)
+
+
+def progress(items: Iterable[Item], what: str, total: int | None = None) -> Iterator[Item]:
+    """Pass items on; show on a terminal how many, once that has taken a second."""
+    if not sys.stderr.isatty():
+        yield from items
+        return
+    from rich.console import Console
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+
+    columns = (
+        TextColumn(what),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+    )
+    bar = Progress(*columns, console=Console(stderr=True), transient=True, auto_refresh=False)
+    begin = shown = time.monotonic()
+    task = bar.add_task(what, total=total)
+    try:
+        for done, item in enumerate(items, start=1):
+            yield item
+            now = time.monotonic()
+            if now - begin > _PROGRESS_DELAY and now - shown > _PROGRESS_INTERVAL:
+                bar.start()
+                bar.update(task, completed=done, refresh=True)
+                shown = now
+    finally:
+        bar.stop()

@@ -1,0 +1,98 @@
+"""Logs as the commands read them: what is odd in one is told once."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from ..errors import LogError
+from .console import progress, say
+
+if TYPE_CHECKING:
+    from ..io import Log
+    from ..record import Record
+    from ..reference_set import ReferenceSet
+
+__all__ = ["problems", "record_of", "records_of", "records_shown", "refuse_mirrored", "stem"]
+
+# How many malformed lines a message names before it says "and so on".
+_NAMED_LINES = 5
+
+
+def records_of(*logs: Log) -> Iterator[Record]:
+    """Read logs one after the other; say what was guessed, malformed, or cannot be meant."""
+    from ..plausibility import Plausibility
+
+    for log in logs:
+        for note in log.notes:
+            say(f"note: {log.path}: {note}")
+        plausibility = Plausibility()
+        for record in log:
+            plausibility.add(record)
+            yield record
+        _report_problems(log)
+        for doubt in plausibility.doubts():
+            say(f"warning: {log.path}: {doubt}")
+
+
+def records_shown(log: Log, what: str, output: Path | None) -> Iterator[Record]:
+    """Read a log and show how far, unless a bar and lines would run into each other."""
+    if output is None and sys.stdout.isatty():
+        return records_of(log)
+    return progress(records_of(log), what, log.count)
+
+
+def record_of(log: Log, index: int) -> Record:
+    """Return one record of a log that has a usable scan."""
+    count = 0
+    for record in records_of(log):
+        if record.index == index:
+            if record.scan is None:
+                raise LogError(f"scan {index} cannot be used: {record.problem}", log.path)
+            return record
+        count += 1
+    raise LogError(f"has {count} scans, from 0 on: no scan {index}", log.path)
+
+
+def _report_problems(log: Log) -> None:
+    """Say once which lines of a log were no use."""
+    for line in problems(log):
+        say(line)
+
+
+def problems(log: Log) -> list[str]:
+    """Return a line that names the lines of no use by number, and the first reason; or none."""
+    if not log.problem_count:
+        return []
+    first = [str(problem.line) for problem in log.problems[:_NAMED_LINES]]
+    more = ", ..." if log.problem_count > len(first) else ""
+    lines = "line" if log.problem_count == 1 else "lines"
+    return [
+        f"warning: {log.path}: {log.problem_count} malformed {lines} "
+        f"({', '.join(first)}{more}); the first: {log.problems[0].reason}"
+    ]
+
+
+def refuse_mirrored(places: ReferenceSet, log: Log) -> None:
+    """End where a laser hangs upside down and nobody said so: its answers would be wrong.
+
+    Raises:
+        LogError: The scans fit the set as their mirror images.
+    """
+    from ..plausibility import mirror_check
+
+    found = mirror_check(places, log)
+    if found.is_mirrored:
+        raise LogError(
+            f"its scans fit the set as their mirror images ({found.mirrored} of "
+            f"{found.mirrored + found.as_given} that fit at all): one of the two was recorded with "
+            "the laser upside down, or was said to be (--upside-down)",
+            log.path,
+        )
+
+
+def stem(path: Path) -> str:
+    """Return the name of a log without what says how it is packed."""
+    return path.name.partition(".")[0]
