@@ -25,6 +25,7 @@ from .decision import evidence
 from .matcher import Matcher
 from .pose import Pose2D
 from .protocol import CORRECT_HEADING, CORRECT_POSITION, Case, recall_at_precision, reliability
+from .scan import LaserScan
 from .settings import Settings
 from .simulator import occlude
 

@@ -90,12 +90,12 @@ PRESETS: Mapping[str, Mapping[str, Any]] = types.MappingProxyType(
                 "rays": 180,
             },
             "decision": {
-                "constant": -4.35,
-                "log_margin": 1.38,
-                "explained": 1.17,
-                "through": -4.43,
-                "heading": 0.78,
-                "anchors": 0.42,
+                "constant": -5.42,
+                "log_margin": 1.26,
+                "explained": 1.35,
+                "through": -4.75,
+                "heading": 0.70,
+                "anchors": 0.87,
             },
         },
     }
