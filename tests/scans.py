@@ -9,6 +9,7 @@ import numpy as np
 from hypothesis import strategies as st
 
 from anchorscan import LaserScan, Pose2D, SensorModel, World, random_building, simulate
+from anchorscan.field import FieldSettings, LikelihoodField, Tiles
 from anchorscan.simulator import random_poses
 
 FULL_TURN = SensorModel(field_of_view=2.0 * math.pi, resolution=math.radians(0.5))
@@ -47,6 +48,13 @@ def box(x1: float, y1: float, x2: float, y2: float) -> list[tuple[float, float, 
 def drawn(walls=(), pillars=(), at: Pose2D = Pose2D(), sensor: SensorModel = EXACT) -> LaserScan:  # noqa: B008
     """Give the exact scan of what is drawn."""
     return simulate(World(np.reshape(walls, (-1, 4)), np.reshape(pillars, (-1, 3))), at, sensor)
+
+
+def small_room(settings: FieldSettings) -> tuple[LaserScan, Tiles]:
+    """A scan of few rays in a room, and the map of it: soon drawn, even without compilation."""
+    sensor = SensorModel(field_of_view=2.0 * math.pi, resolution=math.radians(6.0))
+    scan = drawn(box(-2.0, -1.0, 2.0, 1.0), sensor=sensor)
+    return scan, LikelihoodField(settings, [(scan, Pose2D())]).tiles
 
 
 def reversed_sweep(scan: LaserScan) -> LaserScan:

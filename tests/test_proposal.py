@@ -10,7 +10,17 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scans import BUILDINGS, FULL_TURN, PLACES, WIDE, building, mirrored, seeds, seen_in_building
+from scans import (
+    BUILDINGS,
+    FULL_TURN,
+    PLACES,
+    WIDE,
+    building,
+    mirrored,
+    seeds,
+    seen_in_building,
+    small_room,
+)
 
 from anchorscan import Pose2D, Settings, simulate
 from anchorscan.anchors import AnchorKind, AnchorPoints, anchor_points
@@ -553,9 +563,9 @@ NO_ANCHORS = AnchorPoints(np.empty((0, 2)), np.empty(0, np.int64), np.empty(0))
 
 
 @pytest.mark.interpreted
-def test_nothing_proposes_nothing(known_building):
-    references, tiles = known_building
-    anchors, scan, pose = references[0]
+def test_nothing_proposes_nothing():
+    _, tiles = small_room(DEFAULT.field)
+    anchors, scan, pose = seen(0)
     known = landmarks([(anchors, pose)], LIMITS)
     nothing = landmarks([], LIMITS)
     assert landmarks([(NO_ANCHORS, pose)], LIMITS).positions.shape == (0, 2)
