@@ -61,7 +61,7 @@ def test_a_scan_located_against_itself_is_where_it_was_taken(seed):
         assert hypotheses[0].accepted
         # e_m cannot tell a perfect look-alike from the place itself: both are best then.
         best = [each.pose for each in hypotheses if each.evaluation == 1.0]
-        assert any(pose.distance(place) < 1e-3 and pose.turn(place) < 1e-3 for pose in best)
+        assert any(pose.distance(place) < 2e-3 and pose.turn(place) < 1e-3 for pose in best)
 
 
 @settings(deadline=None, max_examples=20)
