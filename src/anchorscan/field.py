@@ -765,26 +765,33 @@ def passed_through(pose, points, tiles, margin):  # type: ignore[no-untyped-def]
     """Share of rays that pass through a known surface more than ``margin`` before their end.
 
     A ray passes through when it is clear of all surfaces shortly before and shortly after it
-    meets one: a ray that grazes a wall touches its cells without passing through.
+    meets one: a ray that grazes a wall touches its cells without passing through.  Where the
+    nearest surface is far, the cells before it need no look.
     """
     c, s = math.cos(pose[2]), math.sin(pose[2])
     x = pose[0] / tiles.resolution - tiles.column
     y = pose[1] / tiles.resolution - tiles.row
     clear = int(_CLEAR / tiles.reach * _FAR)
     shortly = int(2.0 * _CLEAR / tiles.resolution)
+    cells = tiles.reach / _FAR / tiles.resolution
     through = 0
     for i in range(len(points)):
         length = math.hypot(points[i, 0], points[i, 1])
         dx = (c * points[i, 0] - s * points[i, 1]) / length
         dy = (s * points[i, 0] + c * points[i, 1]) / length
         last_clear, met = -shortly, -1
-        for k in range(int((min(length, _LONGEST_RAY) - margin) / tiles.resolution)):
+        last = int((min(length, _LONGEST_RAY) - margin) / tiles.resolution) - 1
+        k = 0
+        while k <= last:
             code = cell_code(tiles, int(x + k * dx), int(y + k * dy))
             if (code & _FAR) >= clear:
                 if met >= 0 and k - met <= shortly:
                     through += 1
                     break
+                # The corners of the two cells, and the rounding of the code.
+                k += max(int(((code & _FAR) - clear) * cells - 2.5), 0)
                 last_clear, met = k, -1
             elif code & _SURFACE and met < 0 and k - last_clear <= shortly:
                 met = k
+            k += 1
     return through / max(len(points), 1)
