@@ -22,6 +22,18 @@ the way in units of 2 L (the likelihood ratio of an Ornstein-Uhlenbeck process).
 has a *weight*, which collects u along the way, and a *support*, which is of the latest scan
 alone: standing still proves nothing, and a robot that is carried away is doubted at once.
 
+Where furniture has moved since the map was made, every place explains less, the right one as well,
+and u alone cannot tell it from the rest of the world.  A search can: it compares what is explained
+with the best other place in the map.  Its answer comes with the calibrated probability p that it
+is right, and its odds against a robot that is nowhere in the map are
+
+    a = answer_constant + answer_weight * log(p / (1 - p)).
+
+Both u and a are of the same scan, so they are not added: the place of the answer gets the larger
+of the two, and keeps what a is above u for a short way, over which it fades.  Like u it counts by
+the way driven.  And an answer at a place that was not known speaks, by a, for all that had not
+been searched before: this is how a robot that was carried away is found again.
+
 Weights compare places with each other; whether the best of them is any good is another matter.
 A pose that slips off while the robot drives where little is known, or one carried on in a place
 that looks alike, has no rival yet.  So every place keeps its *record*, the mean of u over the
@@ -32,7 +44,8 @@ straight: along a plain corridor they seem to hold the pose by a small share of 
 across it, and scan after scan would make certain what none of them can tell.  So that share of
 the information of the best direction is taken off in every direction.
 
-The constants are fitted on the development logs; the page on the belief says how.
+The constants are fitted on the development logs; the page on the belief says how.  Those of a come
+from a logistic regression between right answers in known buildings and answers in others.
 """
 
 from __future__ import annotations
@@ -52,8 +65,11 @@ from .verification import FEATURES, LARGEST_SCORE, Fits
 
 __all__ = [
     "BeliefSettings",
+    "Claim",
+    "Found",
     "Mixture",
     "admitted",
+    "claimed",
     "has_stood",
     "log_odds",
     "moved",
@@ -68,6 +84,7 @@ _SCORE, _CLOSE, _FREE, _UNKNOWN, _THROUGH = (
     FEATURES.index(name) for name in ("score", "close", "free", "unknown", "through")
 )
 _SMALLEST_SHARE = 0.05
+_LEAST_PROBABILITY = 1e-4
 _NEVER = -1e3  # logarithm of a weight that is none, finite so that differences are
 
 
@@ -100,6 +117,17 @@ class BeliefSettings(BaseModel):
     benefit: float = Field(0.5, description="most log odds for a view that may be blocked")
     most_against: float = Field(6.0, gt=0.0, description="log odds that one scan can take")
     most_for: float = Field(4.0, gt=0.0, description="log odds that one scan can give")
+    answer_constant: float = Field(-1.1, description="log odds of an answer that is half sure")
+    answer_weight: float = Field(
+        1.4, ge=0.0, description="weight of the log odds of an answer's probability"
+    )
+    most_answered: float = Field(6.0, ge=0.0, description="log odds that one answer can give")
+    answer_fades: float = Field(
+        4.0, gt=0.0, description="way on which what an answer added fades, metres"
+    )
+    answer_deviation: float = Field(
+        0.17, gt=0.0, description="of the position of a place that an accepted answer found, metres"
+    )
     support: float = Field(
         0.5, ge=0.0, le=1.0, description="share of the log odds that the latest scan has at once"
     )
@@ -166,6 +194,7 @@ class Mixture:
         weights: (K,) collected along the way.
         support: (K,) log odds of the latest scan.
         record: (K,) mean log odds over the latest way.
+        answered: (K,) log odds that the latest answers add to those of a scan.
         unsearched: Of anywhere else.
         nowhere: Of what was searched and not found.
     """
@@ -175,6 +204,7 @@ class Mixture:
     weights: NDArray[np.float64]
     support: NDArray[np.float64]
     record: NDArray[np.float64]
+    answered: NDArray[np.float64]
     unsearched: float = 0.0
     nowhere: float = _NEVER
 
@@ -182,9 +212,38 @@ class Mixture:
         return len(self.weights)
 
 
+@dataclass(frozen=True, eq=False)
+class Found:
+    """What a search of the map says of one scan.
+
+    Args:
+        poses: (F, 3) T_set_laser, best first, metres and radians.
+        probability: That the first is right.
+        accepted: Whether that is an answer by itself.
+    """
+
+    poses: NDArray[np.float64]
+    probability: float = 0.0
+    accepted: bool = False
+
+
+@dataclass(frozen=True)
+class Claim:
+    """That a place is the right one.
+
+    Args:
+        place: Its index.
+        odds: Logarithm of its odds against a robot that is nowhere in the map.
+    """
+
+    place: int
+    odds: float
+
+
 def nothing_known() -> Mixture:
     """Return the belief of a robot that was just switched on."""
-    return Mixture(np.empty((0, 3)), np.empty((0, 3, 3)), np.empty(0), np.empty(0), np.empty(0))
+    none = np.empty(0)
+    return Mixture(np.empty((0, 3)), np.empty((0, 3, 3)), none, none, none, none)
 
 
 def moved(mixture: Mixture, step: Motion, settings: BeliefSettings) -> Mixture:
@@ -204,18 +263,19 @@ def moved(mixture: Mixture, step: Motion, settings: BeliefSettings) -> Mixture:
         poses=poses,
         covariances=covariances,
         weights=mixture.weights + math.log1p(-away),
+        answered=mixture.answered * math.exp(-way / settings.answer_fades),
         unsearched=unsearched,
         nowhere=mixture.nowhere + math.log1p(-again),
     )
 
 
 def admitted(
-    mixture: Mixture, poses: NDArray[np.float64], settings: BeliefSettings
+    mixture: Mixture, found: Found, settings: BeliefSettings
 ) -> tuple[Mixture, NDArray[np.int64]]:
     """Take in the places that a search of the map found, where they are new.
 
     A place within reach of one that was known may be that one, mistaken (along a corridor, or
-    after a step without odometry), and inherits from it.
+    after a step without odometry), and inherits from it.  What earlier answers added is forgotten.
 
     Returns:
         The mixture, new places last and without weight; (K,) index of the place that each
@@ -223,21 +283,38 @@ def admitted(
     """
     same = (settings.same_distance, settings.same_turn)
     new, parents = _new(
-        mixture.poses, mixture.covariances, mixture.weights, poses, same, settings.reach
+        mixture.poses, mixture.covariances, mixture.weights, found.poses, same, settings.reach
     )
     count = len(new)
-    spread = np.diag(
-        np.square((settings.found_deviation, settings.found_deviation, settings.found_turn))
-    )
+    # Nearly all accepted answers are within half a metre: three of these deviations.
+    position = np.full(count, settings.found_deviation)
+    position[(new == 0) & found.accepted] = settings.answer_deviation
+    deviations = np.column_stack([position, position, np.full(count, settings.found_turn)])
+    spread = np.square(deviations)[:, :, None] * np.eye(3)
     origin = np.concatenate([np.arange(len(mixture)), parents])
     return replace(
         mixture,
-        poses=np.concatenate([mixture.poses, poses[new]]),
-        covariances=np.concatenate([mixture.covariances, np.repeat(spread[None], count, axis=0)]),
+        poses=np.concatenate([mixture.poses, found.poses[new]]),
+        covariances=np.concatenate([mixture.covariances, spread]),
         weights=np.concatenate([mixture.weights, np.full(count, _NEVER)]),
         support=np.concatenate([mixture.support, np.zeros(count)]),
         record=np.concatenate([mixture.record, np.zeros(count)]),
+        answered=np.zeros(len(mixture) + count),
     ), origin
+
+
+def claimed(mixture: Mixture, found: Found, settings: BeliefSettings) -> Claim | None:
+    """Say at which of the places, those just found among them, the answer of a search is."""
+    if not len(found.poses):
+        return None
+    off = mixture.poses - found.poses[0]
+    distance = np.hypot(off[:, 0], off[:, 1])
+    turn = np.abs(np.arctan2(np.sin(off[:, 2]), np.cos(off[:, 2])))
+    same = (distance < settings.same_distance) & (turn < settings.same_turn)
+    p = min(max(found.probability, _LEAST_PROBABILITY), 1.0 - _LEAST_PROBABILITY)
+    odds = settings.answer_constant + settings.answer_weight * math.log(p / (1.0 - p))
+    place = int(np.argmin(np.where(same, distance, math.inf)))
+    return Claim(place, min(odds, settings.most_answered))
 
 
 def stiffness(mixture: Mixture, settings: BeliefSettings) -> NDArray[np.float64]:
@@ -273,6 +350,7 @@ def weighed(
     origin: NDArray[np.int64],
     share: float,
     settings: BeliefSettings,
+    claim: Claim | None = None,
 ) -> Mixture:
     """Weigh all places by how well a scan fits there.
 
@@ -282,9 +360,13 @@ def weighed(
         origin: (K,) where each comes from, as `admitted` says.
         share: Of new evidence in this scan, in [0, 1].
         settings: Of the belief.
+        claim: The answer of a search for this scan, where there was one.
     """
-    odds = log_odds(fits, settings)
-    count = len(mixture)
+    odds, answered, count = log_odds(fits, settings), mixture.answered, len(mixture)
+    if claim is not None:
+        answered = np.zeros(count)
+        answered[claim.place] = max(claim.odds - odds[claim.place], 0.0)
+    odds = odds + answered
     weights = mixture.weights.copy()
     known = origin == np.arange(count)
     inherits = ~known & (origin >= 0)
@@ -293,6 +375,8 @@ def weighed(
     unsearched, nowhere = mixture.unsearched, mixture.nowhere
     found = origin < 0
     if found.any():
+        if claim is not None and found[claim.place]:
+            unsearched += max(claim.odds, 0.0)
         total = _log_sum(np.append(odds[found], 0.0))
         weights[found] = unsearched + (1.0 - settings.support) * odds[found] - total
         nowhere = _log_sum(np.array([nowhere, unsearched - total]))
@@ -304,7 +388,7 @@ def weighed(
     covariances = _inverses(_inverses(mixture.covariances) + information)
     latest = min(share * settings.way_alike / settings.record_way, 1.0)
     record = np.where(known, mixture.record + latest * (odds - mixture.record), odds)
-    return Mixture(fits.poses, covariances, weights, odds, record, unsearched, nowhere)
+    return Mixture(fits.poses, covariances, weights, odds, record, answered, unsearched, nowhere)
 
 
 def tidied(mixture: Mixture, settings: BeliefSettings) -> Mixture:
@@ -329,6 +413,7 @@ def tidied(mixture: Mixture, settings: BeliefSettings) -> Mixture:
         weights[good] - one,
         support[good],
         mixture.record[order[good]],
+        mixture.answered[order[good]],
         max(mixture.unsearched - one, _NEVER),
         max(lost - one, _NEVER),
     )

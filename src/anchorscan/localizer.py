@@ -23,8 +23,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .belief import (
+    Found,
     Mixture,
     admitted,
+    claimed,
     has_stood,
     moved,
     nothing_known,
@@ -162,13 +164,15 @@ class Localizer:
             self._mixture = moved(self._mixture, step, settings)
             return self._report()
         expected = moved(self._mixture, step, settings)
-        mixture, origin = expected, np.arange(len(expected))
+        mixture, origin, claim = expected, np.arange(len(expected)), None
         if self._is_due(step):
-            mixture, origin = admitted(expected, self._search(scan), settings)
+            found = self._search(scan)
+            mixture, origin = admitted(expected, found, settings)
+            claim = claimed(mixture, found, settings)
         if len(mixture):
             fits = self._places.follow(scan, mixture.poses, stiffness(mixture, settings))
             share = self._share(step, expected, fits)
-            mixture = tidied(weighed(mixture, fits, origin, share, settings), settings)
+            mixture = tidied(weighed(mixture, fits, origin, share, settings, claim), settings)
         self._mixture = mixture
         return self._report()
 
@@ -192,12 +196,15 @@ class Localizer:
         if kept is None or kept.distance(self._odometer.latest) >= self._window / _KEPT:
             self._recent.append(Record(0, scan, odometry=self._odometer.latest))
 
-    def _search(self, scan: LaserScan) -> NDArray[np.float64]:
+    def _search(self, scan: LaserScan) -> Found:
         if self._recent and self._odometer.latest is not None:
             latest = Record(0, scan, odometry=self._odometer.latest)
             scan = joined_scan([*self._recent, latest], self._window)
         in_map = self._places.explain(scan).in_map
-        return np.empty((0, 3)) if in_map is None else in_map.fits.poses
+        if in_map is None or not len(in_map.fits):
+            return Found(np.empty((0, 3)))
+        decision = in_map.decision
+        return Found(in_map.fits.poses, float(decision.probabilities[0]), decision.accepted)
 
     def _share(self, step: Motion, expected: Mixture, fits: Fits) -> float:
         """How much of a scan's evidence is new; by the motion seen, where none was measured."""
