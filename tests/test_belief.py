@@ -13,6 +13,8 @@ from hypothesis import strategies as st
 from anchorscan import Pose2D
 from anchorscan.belief import (
     BeliefSettings,
+    Claim,
+    Found,
     Mixture,
     _certain,
     _inverses,
@@ -20,6 +22,7 @@ from anchorscan.belief import (
     _new,
     _owners,
     admitted,
+    claimed,
     has_stood,
     log_odds,
     moved,
@@ -54,6 +57,7 @@ def some_mixture(rng, count):
         rng.normal(-2.0, 2.0, count),
         rng.uniform(-6.0, 4.0, count),
         rng.uniform(-6.0, 4.0, count),
+        rng.uniform(0.0, 4.0, count),
         float(rng.normal(-2.0, 2.0)),
         float(rng.normal(-2.0, 2.0)),
     )
@@ -179,9 +183,11 @@ def test_probability_is_neither_lost_nor_made_on_the_way(seed, way, turn):
 def test_a_step_keeps_places_bounded_apart_and_summing_to_one(seed, share):
     rng = np.random.default_rng(seed)
     mixture = some_mixture(rng, 20)
-    mixture, origin = admitted(mixture, some_poses(rng, 30, 20.0), SETTINGS)
+    found = Found(some_poses(rng, 30, 20.0), float(rng.uniform()), bool(rng.integers(2)))
+    mixture, origin = admitted(mixture, found, SETTINGS)
+    claim = claimed(mixture, found, SETTINGS)
     fits = some_fits(rng, mixture.poses)
-    after = tidied(weighed(mixture, fits, origin, share, SETTINGS), SETTINGS)
+    after = tidied(weighed(mixture, fits, origin, share, SETTINGS, claim), SETTINGS)
     assert len(after) <= SETTINGS.places
     assert total(after) == pytest.approx(1.0)
     assert np.isfinite(after.covariances).all()
@@ -189,6 +195,7 @@ def test_a_step_keeps_places_bounded_apart_and_summing_to_one(seed, share):
     owners = _owners(after.poses, SETTINGS.same_distance, SETTINGS.same_turn)
     assert owners.tolist() == list(range(len(after)))
     fields = (after.poses, after.covariances, after.weights, after.support, after.record)
+    fields += (after.answered,)
     assert {len(each) for each in fields} == {len(after)}
 
 
@@ -204,6 +211,7 @@ def test_the_order_of_places_does_not_matter(seed):
         weights=mixture.weights[order],
         support=mixture.support[order],
         record=mixture.record[order],
+        answered=mixture.answered[order],
     )
     one, other = tidied(mixture, SETTINGS), tidied(turned, SETTINGS)
     assert np.allclose(one.poses, other.poses)
@@ -237,7 +245,9 @@ def test_a_scan_of_what_nobody_mapped_says_little():
 
 def test_standing_still_proves_nothing():
     rng = np.random.default_rng(0)
-    mixture, origin = admitted(nothing_known(), np.array([[0.0, 0, 0], [9.0, 0, 0]]), SETTINGS)
+    mixture, origin = admitted(
+        nothing_known(), Found(np.array([[0.0, 0, 0], [9.0, 0, 0]])), SETTINGS
+    )
     fits = some_fits(rng, mixture.poses, score=[0.95, 0.9], close=1.0, unknown=0.0, through=0.0)
     mixture = tidied(weighed(mixture, fits, origin, SETTINGS.still, SETTINGS), SETTINGS)
     first = probabilities(mixture, SETTINGS)
@@ -248,7 +258,7 @@ def test_standing_still_proves_nothing():
 
 def test_a_scan_that_fits_badly_holds_the_pose_less():
     rng = np.random.default_rng(0)
-    mixture, _ = admitted(nothing_known(), np.zeros((1, 3)), SETTINGS)
+    mixture, _ = admitted(nothing_known(), Found(np.zeros((1, 3))), SETTINGS)
     spreads = []
     for score in (0.97, 0.3):
         fits = some_fits(rng, mixture.poses, score=score, close=1.0, unknown=0.0, through=0.0)
@@ -263,9 +273,108 @@ def test_a_place_that_lately_fits_badly_or_much_worse_than_another_has_not_stood
         count = len(values)
         covariances = np.repeat(np.eye(3)[None], count, axis=0)
         zeros = np.zeros(count)
-        return Mixture(np.zeros((count, 3)), covariances, zeros, zeros, np.array(values))
+        return Mixture(np.zeros((count, 3)), covariances, zeros, zeros, np.array(values), zeros)
 
     assert has_stood(records(3.0), 0, SETTINGS)
     assert not has_stood(records(-1.0), 0, SETTINGS)
     assert has_stood(records(2.0, 4.0), 0, SETTINGS)
     assert not has_stood(records(0.2, 4.0), 0, SETTINGS)
+
+
+# Answers of a search
+
+
+TWO = np.array([[0.0, 0.0, 0.0], [9.0, 0.0, 0.0]])
+MOVED_FURNITURE = {"score": [0.78, 0.7], "close": 1.0, "unknown": 0.0, "through": 0.0}
+
+
+def driven(probability, metres=2.0, step=0.1, **features):
+    """What is believed after a drive at the first of two places, searched each half metre."""
+    rng, mixture = np.random.default_rng(0), nothing_known()
+    accepted = probability >= 0.96
+    for number in range(round(metres / step)):
+        on = motion(Pose2D(), Pose2D(step, 0.0, 0.0), None, SETTINGS.motion)
+        mixture, claim = moved(mixture, on, SETTINGS), None
+        origin = np.arange(len(mixture))
+        if number % 5 == 0:
+            found = Found(TWO + [number * step, 0.0, 0.0], probability, accepted)
+            mixture, origin = admitted(mixture, found, SETTINGS)
+            claim = claimed(mixture, found, SETTINGS)
+        shares = {**MOVED_FURNITURE, **features}
+        values = {name: np.resize(value, len(mixture)) for name, value in shares.items()}
+        fits = some_fits(rng, mixture.poses, **values)
+        share = step / SETTINGS.way_alike
+        mixture = tidied(weighed(mixture, fits, origin, share, SETTINGS, claim), SETTINGS)
+    return mixture
+
+
+def test_sure_answers_make_sure_of_a_place_that_explains_too_little_by_itself():
+    unsure, sure = (probabilities(driven(p), SETTINGS).max(initial=0.0) for p in (0.1, 0.99))
+    assert unsure < 0.1
+    assert sure > 0.9
+    first = np.argmax(probabilities(driven(0.99), SETTINGS))
+    assert abs(driven(0.99).poses[first, 0] - 2.0) < 0.2
+    assert has_stood(driven(0.99), int(first), SETTINGS)
+    assert not has_stood(driven(0.1), 0, SETTINGS)
+
+
+def test_an_answer_that_is_not_sure_is_not_taken_against_its_place():
+    """Two places that look alike make every answer unsure; that is no sign of elsewhere."""
+    good = {"score": [0.97, 0.97]}
+    unsure, sure = driven(0.05, **good), driven(0.4, **good)
+    assert np.allclose(probabilities(unsure, SETTINGS), probabilities(sure, SETTINGS), atol=0.05)
+    assert math.exp(unsure.nowhere) < 0.1
+
+
+@given(p=st.floats(0.0, 1.0), more=st.floats(0.0, 1.0))
+def test_a_surer_answer_gives_its_place_no_less_and_never_more_than_the_most(p, more):
+    mixture, _ = admitted(nothing_known(), Found(TWO), SETTINGS)
+    claims = [claimed(mixture, Found(TWO, min(q, 1.0)), SETTINGS) for q in (p, p + more)]
+    assert all(claim is not None and claim.place == 0 for claim in claims)
+    assert claims[0].odds <= claims[1].odds <= SETTINGS.most_answered
+
+
+def test_an_answer_is_claimed_for_the_nearest_place_that_is_one_with_it():
+    near = np.array([[0.2, 0.0, 0.0], [0.1, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    mixture, _ = admitted(nothing_known(), Found(near), SETTINGS)
+    claim = claimed(mixture, Found(np.zeros((1, 3)), 0.99), SETTINGS)
+    assert claim is not None
+    assert claim.place == 1
+    assert claimed(mixture, Found(np.empty((0, 3))), SETTINGS) is None
+
+
+def test_what_an_answer_added_fades_on_the_way_and_ends_with_the_next():
+    mixture = driven(0.99, metres=0.1)
+    before = mixture.answered.max()
+    on = motion(Pose2D(), Pose2D(SETTINGS.answer_fades, 0.0, 0.0), None, SETTINGS.motion)
+    after = moved(mixture, on, SETTINGS)
+    assert before > 3.0
+    assert after.answered.max() == pytest.approx(before * math.exp(-1.0), rel=0.01)
+    assert not admitted(mixture, Found(np.empty((0, 3))), SETTINGS)[0].answered.any()
+
+
+def test_an_answer_at_a_new_place_soon_outweighs_a_place_that_fits_no_more():
+    """After a kidnapping; an answer at the known place changes nothing."""
+    rng = np.random.default_rng(0)
+    known, origin = admitted(nothing_known(), Found(TWO[:1]), SETTINGS)
+    good = some_fits(rng, known.poses, score=0.97, close=1.0, unknown=0.0, through=0.0)
+    known = tidied(weighed(known, good, origin, 1.0, SETTINGS), SETTINGS)
+    known = replace(known, unsearched=math.log(1e-4))
+    shares = {"close": 1.0, "unknown": 0.0, "through": 0.0}
+    worth = []
+    for claim in (None, Claim(1, 6.0)):
+        mixture, origin = admitted(known, Found(TWO[1:]), SETTINGS)
+        fits = some_fits(rng, mixture.poses, score=[0.6, 0.95], **shares)
+        after = tidied(weighed(mixture, fits, origin, 0.1, SETTINGS, claim), SETTINGS)
+        worth.append(probabilities(after, SETTINGS)[np.argmax(after.poses[:, 0])])
+    assert worth[1] > 10.0 * worth[0]
+
+
+def test_only_an_accepted_answer_tells_the_position_more_closely():
+    spreads = [
+        admitted(nothing_known(), Found(TWO, 0.97, accepted), SETTINGS)[0].covariances
+        for accepted in (False, True)
+    ]
+    assert np.sqrt(spreads[0][0, 0, 0]) == pytest.approx(SETTINGS.found_deviation)
+    assert np.sqrt(spreads[1][0, 0, 0]) == pytest.approx(SETTINGS.answer_deviation)
+    assert np.array_equal(spreads[0][1], spreads[1][1])

@@ -69,11 +69,12 @@ def fed(localizer: Localizer, records: list[Record], *, wheels: bool = True) -> 
 
 
 @pytest.mark.parametrize(
-    ("wheels", "share"), [(True, 0.5), (False, 0.05)], ids=["odometry", "no odometry"]
+    ("wheels", "share"), [(True, 0.45), (False, 0.05)], ids=["odometry", "no odometry"]
 )
 def test_a_lost_robot_is_found_and_never_sure_of_a_wrong_place(
     places: Matcher, journey: list[Record], wheels: bool, share: float
 ) -> None:
+    """The first 40 % of the journey are outside of the map."""
     beliefs = fed(Localizer(places), journey, wheels=wheels)
     sure = [is_right(b, r) for b, r in zip(beliefs, journey, strict=True) if b.accepted]
     assert len(sure) >= share * len(journey)

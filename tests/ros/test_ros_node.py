@@ -529,11 +529,8 @@ def test_a_turtlebot_finds_itself_on_a_college_floor(
     assert mounting is not None
     recording = Recording(tmp_path / "olin.npz", records, mounting, begin=0.0)
     map_file = save_map(tmp_path / "map.npz", load_map(folder / "mac_1st_floor_final.yaml"))
-    # Much of the furniture stands elsewhere by now: see the page on judging a map.
-    changed = tmp_path / "changed.json"
-    changed.write_text('{"belief": {"elsewhere": 0.75}}')
     laser_pose = [mounting.x, mounting.y, mounting.theta]
-    start(laser_pose=laser_pose, continuous=True, settings_file=str(changed))
+    start(laser_pose=laser_pose, continuous=True)
     robot = start(player)
     observer.listen()
     robot.tell(do="map", file=map_file)
