@@ -370,6 +370,19 @@ def test_an_answer_at_a_new_place_soon_outweighs_a_place_that_fits_no_more():
     assert worth[1] > 10.0 * worth[0]
 
 
+def test_an_answer_takes_up_a_place_again_that_had_been_given_up():
+    rng = np.random.default_rng(0)
+    mixture, _ = admitted(nothing_known(), Found(TWO), SETTINGS)
+    mixture = replace(mixture, weights=np.array([-10.0, -12.0]), unsearched=-3.0, nowhere=-0.1)
+    fits = some_fits(rng, mixture.poses, score=0.95, close=1.0, unknown=0.0, through=0.0)
+    worth = []
+    for claim in (None, Claim(1, 5.0)):
+        after = weighed(mixture, fits, np.arange(2), 0.1, SETTINGS, claim)
+        worth.append(probabilities(tidied(after, SETTINGS), SETTINGS).max())
+    assert worth[0] < 0.01
+    assert worth[1] > 0.5
+
+
 def test_only_an_accepted_answer_tells_the_position_more_closely():
     spreads = [
         admitted(nothing_known(), Found(TWO, 0.97, accepted), SETTINGS)[0].covariances

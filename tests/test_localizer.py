@@ -69,7 +69,7 @@ def fed(localizer: Localizer, records: list[Record], *, wheels: bool = True) -> 
 
 
 @pytest.mark.parametrize(
-    ("wheels", "share"), [(True, 0.45), (False, 0.05)], ids=["odometry", "no odometry"]
+    ("wheels", "share"), [(True, 0.5), (False, 0.05)], ids=["odometry", "no odometry"]
 )
 def test_a_lost_robot_is_found_and_never_sure_of_a_wrong_place(
     places: Matcher, journey: list[Record], wheels: bool, share: float
@@ -162,9 +162,8 @@ def test_no_odometry_clock_or_scan_breaks_the_belief(
         named = sum(each.probability for each in belief.hypotheses)
         assert 0.0 <= belief.probability <= 1.0
         assert named + belief.elsewhere <= 1.0 + 1e-9
-        assert [h.probability for h in belief.hypotheses] == sorted(
-            (h.probability for h in belief.hypotheses), reverse=True
-        ) or not belief.accepted
+        most = max((h.probability for h in belief.hypotheses), default=0.0)
+        assert belief.probability == most or not belief.accepted
         assert all(h.pose is not None and h.pose.is_finite() for h in belief.hypotheses)
 
 

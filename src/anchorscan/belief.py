@@ -31,8 +31,8 @@ is right, and its odds against a robot that is nowhere in the map are
 
 Both u and a are of the same scan, so they are not added: the place of the answer gets the larger
 of the two, and keeps what a is above u for a short way, over which it fades.  Like u it counts by
-the way driven.  And an answer at a place that was not known speaks, by a, for all that had not
-been searched before: this is how a robot that was carried away is found again.
+the way driven.  And an answer speaks, by a, for all that had not been searched before, be its place
+new or one that was given up: this is how a robot that was carried away is found again.
 
 Weights compare places with each other; whether the best of them is any good is another matter.
 A pose that slips off while the robot drives where little is known, or one carried on in a place
@@ -374,11 +374,13 @@ def weighed(
     weights[known | inherits] += share * odds[known | inherits]
     unsearched, nowhere = mixture.unsearched, mixture.nowhere
     found = origin < 0
+    if claim is not None:
+        found[claim.place] = True
+        unsearched += max(claim.odds, 0.0)
     if found.any():
-        if claim is not None and found[claim.place]:
-            unsearched += max(claim.odds, 0.0)
         total = _log_sum(np.append(odds[found], 0.0))
-        weights[found] = unsearched + (1.0 - settings.support) * odds[found] - total
+        fresh = unsearched + (1.0 - settings.support) * odds[found] - total
+        weights[found] = np.logaddexp(np.where(origin[found] < 0, _NEVER, weights[found]), fresh)
         nowhere = _log_sum(np.array([nowhere, unsearched - total]))
         unsearched = _NEVER
     new = np.where(known, min(settings.news * share, 1.0), 1.0)
