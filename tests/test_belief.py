@@ -297,7 +297,7 @@ def driven(probability, metres=2.0, step=0.1, **features):
         mixture, claim = moved(mixture, on, SETTINGS), None
         origin = np.arange(len(mixture))
         if number % 5 == 0:
-            found = Found(TWO + [number * step, 0.0, 0.0], probability, accepted)
+            found = Found(TWO + np.array([number * step, 0.0, 0.0]), probability, accepted)
             mixture, origin = admitted(mixture, found, SETTINGS)
             claim = claimed(mixture, found, SETTINGS)
         shares = {**MOVED_FURNITURE, **features}
