@@ -68,6 +68,11 @@ class DatabaseSettings(BaseModel):
     candidates: int | None = Field(
         None, ge=1, description="references that are followed further; null for all"
     )
+    compared: int = Field(
+        1000,
+        ge=0,
+        description="references in a map that are compared by what they saw to choose these",
+    )
 
 
 @dataclass(frozen=True, eq=False)

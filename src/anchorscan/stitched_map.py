@@ -26,6 +26,7 @@ from .field import FieldArrays, LikelihoodField, Tiles
 from .graph import anchor_graph
 from .hypothesis import Hypothesis
 from .pairwise import Known
+from .panorama import reordered, view, worth
 from .placed import Lot, lot_of, nearest, tidied
 from .pose import Pose2D
 from .proposal import (
@@ -56,7 +57,8 @@ class MapSearch:
     """What a search in the stitched map came through.
 
     Args:
-        votes: Of the candidate references, best first; None where all may propose.
+        votes: Of the candidate references, in the order of what they are worth (``panorama``);
+            None where all may propose.
         proposals: Alignments that passed the first check.
         fits: What is left after all sieves, of the highest worth first.
         decision: What they are worth.
@@ -189,6 +191,7 @@ class StitchedMap:
             found = {
                 "references.identifiers": lot.identifiers,
                 "references.poses": lot.poses,
+                "references.panoramas": lot.panoramas,
                 **{f"anchors.{name}": array for name, array in vars(lot.anchors).items()},
                 **self._stored_landmarks(lot),
                 **{f"field.{name}": each for name, each in self._field.arrays()._asdict().items()},
@@ -242,13 +245,14 @@ class StitchedMap:
 
         Args:
             description: Of the scan.
-            most: How many references, those of the highest quality, may propose; None for all.
+            most: How many references, the best by votes and what they saw, may propose; None
+                for all.
         """
         settings, content = self._settings, self._content
         tiles = content.tiles
         seen = readings(description.angles, settings.verification)
         large = seen[seen[:, 2] == 0.0]
-        votes = None if most is None else self._voting().votes(description.graph, most)
+        votes = None if most is None else self._candidates(description, most, content)
         related = content.landmarks if votes is None else self._some(votes.references, content)
         proposed = proposals(description.anchors, large, related, tiles, settings.proposal)
         if not len(proposed.poses):
@@ -333,6 +337,20 @@ class StitchedMap:
                 )
             return self._database
 
+    def _candidates(self, description: Description, most: int, content: _Content) -> Votes:
+        """Choose by votes, and among the first of these by what they saw."""
+        compared = self._settings.database.compared
+        votes = self._voting().votes(description.graph, max(most, compared))
+        first = votes.references[:compared]
+        worths = np.full(len(first), -np.inf)  # of those removed in between
+        seen = view(description.angles.points, description.anchors)
+        for lot in content.lots:
+            places = lot.find_all(first)
+            at = np.flatnonzero(places >= 0)
+            found = (places[at], votes.quality[at], most)
+            worths[at] = worth(seen, lot.anchors, lot.panoramas, *found)
+        return reordered(votes, worths, most)
+
     def _some(self, identifiers: NDArray[np.int64], content: _Content) -> Landmarks:
         """Join the relations of single references, less any removed in between."""
         found = [content.find(identifier) for identifier in identifiers.tolist()]
@@ -394,6 +412,7 @@ def _section(arrays: Mapping[str, NDArray[Any]], prefix: str) -> dict[str, NDArr
 def _lot_from(arrays: Mapping[str, NDArray[Any]], settings: Settings) -> Lot:
     """Make a lot of stored arrays, whose landmarks are there already."""
     anchors = AnchorStack(**_section(arrays, "anchors."))
+    panoramas = arrays["references.panoramas"]
     identifiers, poses = arrays["references.identifiers"], arrays["references.poses"]
     count = len(identifiers)
     lot = Lot(
@@ -401,6 +420,7 @@ def _lot_from(arrays: Mapping[str, NDArray[Any]], settings: Settings) -> Lot:
         np.arange(count),
         poses,
         anchors,
+        panoramas,
         [None] * count,
         np.ones(count, np.bool_),
         settings.proposal,
