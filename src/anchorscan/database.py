@@ -69,7 +69,7 @@ class DatabaseSettings(BaseModel):
         None, ge=1, description="references that are followed further; null for all"
     )
     compared: int = Field(
-        1000,
+        750,
         ge=0,
         description="references in a map that are compared by what they saw to choose these",
     )

@@ -52,13 +52,14 @@ _READINGS = 40
 _FARTHEST_READING = 30.0
 _EVERY = 4
 # Pairs of anchor points: directions differ by no more, radians; the scan was taken no farther
-# from the reference; shifts that agree, metres; pairs of one quarter turn; shifts that are tried.
+# from the reference; shifts that agree, metres; pairs of one quarter turn; shifts that are tried;
+# anchor points of one scan: more make some searches slow, and choose hardly better.
 _ALIKE = 0.5
 _SHIFT = 5.0
 _AGREEING = 0.2
-_MOST_PAIRS = 256
+_MOST_PAIRS = 48
 _TRIED = 2
-_MOST_ANCHORS = 64
+_MOST_ANCHORS = 20
 # A reading is where it is expected within so many metres and so much of its distance.
 _TOLERANCE, _TOLERANCE_SHARE = 0.07, 0.015
 _PER_PAIR, _PER_VOTE = 0.05, 0.3
@@ -260,30 +261,29 @@ def _shifts(seen, positions, kinds, directions, pairs, tried):  # type: ignore[n
 
     Rows of ``tried`` are the quarter turn, the shift, and the pairs that agree; returns how many.
     """
+    counts = np.zeros(4, np.int64)
+    for i in range(len(seen.kinds)):
+        for j in range(len(kinds)):
+            if kinds[j] != seen.kinds[i]:
+                continue
+            # Directions tell the quarter turn: no pair is alike in two of them.
+            off = (directions[j] - seen.directions[i]) * np.float32(2.0 / math.pi)
+            quarters = math.floor(off + np.float32(0.5))
+            turn = int(quarters) & 3
+            if abs(off - quarters) > np.float32(_ALIKE * 2.0 / math.pi):
+                continue
+            c, s = np.float32(_QUARTERS[turn][0]), np.float32(_QUARTERS[turn][1])
+            dx = positions[j, 0] - (c * seen.positions[i, 0] - s * seen.positions[i, 1])
+            dy = positions[j, 1] - (s * seen.positions[i, 0] + c * seen.positions[i, 1])
+            if dx * dx + dy * dy > np.float32(_SHIFT * _SHIFT) or counts[turn] == _MOST_PAIRS:
+                continue
+            pair = pairs[turn, counts[turn]]
+            pair[0], pair[1], pair[2], pair[3] = dx, dy, i, j
+            counts[turn] += 1
     found = 0
     for turn in range(4):
-        c, s = np.float32(_QUARTERS[turn][0]), np.float32(_QUARTERS[turn][1])
-        count = 0
-        for i in range(len(seen.kinds)):
-            x = c * seen.positions[i, 0] - s * seen.positions[i, 1]
-            y = s * seen.positions[i, 0] + c * seen.positions[i, 1]
-            direction = seen.directions[i] + np.float32(0.5 * math.pi * turn)
-            for j in range(len(kinds)):
-                if kinds[j] != seen.kinds[i]:
-                    continue
-                off = (directions[j] - direction) * np.float32(0.5 / math.pi)
-                off -= np.float32(math.floor(off + np.float32(0.5)))
-                dx, dy = positions[j, 0] - x, positions[j, 1] - y
-                if (
-                    abs(off) <= np.float32(0.5 * _ALIKE / math.pi)
-                    and dx * dx + dy * dy <= np.float32(_SHIFT * _SHIFT)
-                    and count < _MOST_PAIRS
-                ):
-                    pairs[count, 0], pairs[count, 1] = dx, dy
-                    pairs[count, 2], pairs[count, 3] = i, j
-                    count += 1
-        for k in range(count):
-            found = _noted(pairs, count, k, turn, tried, found)
+        for k in range(counts[turn]):
+            found = _noted(pairs[turn], counts[turn], k, turn, tried, found)
     return found
 
 
@@ -350,7 +350,7 @@ def _worth(seen, stack, panoramas, places, votes, tables, most):  # type: ignore
     positions = np.empty((_MOST_ANCHORS, 2), np.float32)
     kinds = np.empty(_MOST_ANCHORS, np.int64)
     directions = np.empty(_MOST_ANCHORS, np.float32)
-    pairs = np.empty((_MOST_PAIRS, 4), np.float32)
+    pairs = np.empty((4, _MOST_PAIRS, 4), np.float32)
     tried = np.empty((_TRIED, 4), np.float32)
     distances = np.empty(DIRECTIONS, np.float32)
     for k in range(len(places)):
