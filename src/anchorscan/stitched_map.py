@@ -9,9 +9,11 @@ from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import reduce
+from queue import SimpleQueue
 from typing import Any, TypeVar
 
 import numpy as np
@@ -50,6 +52,7 @@ _REMEMBERED = 4096
 _MOST_STANDING = 2048
 
 Value = TypeVar("Value")
+Other = TypeVar("Other")
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,12 +83,12 @@ class _Content:
 
     Args:
         lots: The references.
-        tiles: The field stitched from them.
+        field: Stitched from them, and from what was added since.
         count: References that are there.
     """
 
     lots: tuple[Lot, ...]
-    tiles: Tiles
+    field: LikelihoodField
     count: int
 
     def find(self, identifier: int) -> tuple[Lot, int] | None:
@@ -95,6 +98,11 @@ class _Content:
             if place is not None:
                 return lot, place
         return None
+
+    @property
+    def tiles(self) -> Tiles:
+        """The map as it is now."""
+        return self.field.tiles
 
     @property
     def landmarks(self) -> list[Landmarks]:
@@ -115,10 +123,15 @@ class StitchedMap:
 
     def __init__(self, settings: Settings, known: Iterable[Known] = ()) -> None:
         self._begin(settings, _no_reading)
-        lot = lot_of(map(self._remembered, known), 0, settings.proposal)
+        # The map is stitched while the references are still being described.
+        described = _Passed[tuple[LaserScan, Pose2D]]()
+        with ThreadPoolExecutor(1) as thread:
+            field = thread.submit(LikelihoodField, settings.field, described)
+            with described:
+                passed = (described.put(_placed(each.reference), each) for each in known)
+                lot = lot_of(map(self._remembered, passed), 0, settings.proposal)
+            self._field = field.result()
         self._next_serial = len(lot)
-        references = [reference for reference in lot.references if reference is not None]
-        self._field = LikelihoodField(settings.field, map(_placed, references))
         self._hold((lot,))
 
     @classmethod
@@ -321,7 +334,7 @@ class StitchedMap:
         return hypotheses, known
 
     def _hold(self, lots: tuple[Lot, ...]) -> None:
-        self._content = _Content(lots, self._field.tiles, sum(map(len, lots)))
+        self._content = _Content(lots, self._field, sum(map(len, lots)))
 
     def _voting(self) -> RelationshipDatabase:
         with self._preparing:
@@ -383,6 +396,31 @@ class StitchedMap:
         if len(self._memory) < _REMEMBERED:
             self._memory[len(self._memory)] = known
         return known
+
+
+class _Passed(Iterator[Value]):
+    """Values that one thread passes on to another until it is done."""
+
+    def __init__(self) -> None:
+        self._values: SimpleQueue[Value | None] = SimpleQueue()
+
+    def put(self, value: Value, returned: Other) -> Other:
+        """Pass on a value, and return another one."""
+        self._values.put(value)
+        return returned
+
+    def __enter__(self) -> None:
+        """Nothing is done yet."""
+
+    def __exit__(self, *_: object) -> None:
+        self._values.put(None)
+
+    def __next__(self) -> Value:
+        value = self._values.get()
+        if value is None:
+            self._values.put(None)  # for whoever asks again
+            raise StopIteration
+        return value
 
 
 class _Memory(dict[int, Value]):
