@@ -13,7 +13,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scans import EXACT, WIDE, box, building, drawn, places, seeds, sweeps
 
-from anchorscan import AnchorscanError, LaserScan, Pose2D, SensorModel, Settings, simulate
+from anchorscan import (
+    AnchorscanError,
+    LaserScan,
+    Pose2D,
+    SensorModel,
+    Settings,
+    evidence,
+    simulate,
+)
 from anchorscan import field as field_module
 from anchorscan.field import (
     FieldSettings,
@@ -564,3 +572,20 @@ def test_readers_see_whole_changes_while_a_writer_goes_on():
     reader.join()
     assert seen <= {without, having}
     assert seen_by(field.tiles) == without
+
+
+def test_evidence_that_is_packed_and_opened_again_is_the_same(monkeypatch):
+    scans, others = placed(3, 11), placed(2, 12, Pose2D(60.0, 10.0, 0.3))
+    expected = all_bytes(LikelihoodField(COARSE, [*scans, *others]))
+    monkeypatch.setattr(evidence, "_MOST_OPEN", 6)
+    field = LikelihoodField(COARSE, scans)
+    for _ in range(3):
+        for scan, pose in others:
+            field.add(scan, pose)
+            assert field.tiles
+        for scan, pose in [*others, scans[0]]:
+            field.remove(scan, pose)
+        field.add(*scans[0])
+    for scan, pose in others:
+        field.add(scan, pose)
+    assert all_bytes(field) == expected

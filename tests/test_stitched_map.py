@@ -28,7 +28,7 @@ from anchorscan.anchors import stack_anchors
 from anchorscan.description import describe
 from anchorscan.pairwise import Known
 from anchorscan.panorama import panorama, view, worth
-from anchorscan.placed import lot_of, nearest
+from anchorscan.placed import lot_of, nearest, tidied
 from anchorscan.stitched_map import StitchedMap
 
 DEFAULT = Settings.preset("default")
@@ -256,6 +256,16 @@ def test_the_best_voted_references_propose():
         assert few.proposals.proposed <= everything.proposals.proposed
         all_of_them = PLACES[0].explain(scan, len(references)).in_map
         assert set(all_of_them.votes.references.tolist()) == identifiers
+
+
+def test_a_lot_that_was_emptied_goes_and_the_one_before_it_stays_as_it_is():
+    known = [Known(each, describe(each.scan, DEFAULT)) for each in BUILT[0][0]]
+    many = lot_of(known[:-1], 0, DEFAULT.proposal)
+    one = lot_of(known[-1:], len(many), DEFAULT.proposal)
+    (left,) = tidied([many, one.without(0)])
+    assert left is many
+    (empty,) = tidied([lot_of(known[:1], 0, DEFAULT.proposal).without(0)])
+    assert len(empty) == 0
 
 
 @given(numbers, st.integers(0, 11), st.integers(1, 12))

@@ -218,7 +218,10 @@ def tidied(lots: Sequence[Lot]) -> tuple[Lot, ...]:
     left = list(lots)
     while len(left) > 1:
         before, last = len(left[-2]), len(left[-1])
-        if last and before + last > _SMALLEST and last <= _MERGED_SHARE * before:
+        if not last:  # merged, it would have all before it made anew
+            left.pop()
+            continue
+        if before + last > _SMALLEST and last <= _MERGED_SHARE * before:
             break
         other = left.pop()
         merged = left[-1].followed_by(other)
