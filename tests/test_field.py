@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import threading
 from collections import Counter, defaultdict
 
 import numpy as np
@@ -12,7 +13,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scans import EXACT, WIDE, box, building, drawn, places, seeds, sweeps
 
-from anchorscan import AnchorscanError, LaserScan, Pose2D, SensorModel, Settings, simulate
+from anchorscan import (
+    AnchorscanError,
+    LaserScan,
+    Pose2D,
+    SensorModel,
+    Settings,
+    evidence,
+    simulate,
+)
+from anchorscan import field as field_module
 from anchorscan.field import (
     FieldSettings,
     LikelihoodField,
@@ -507,3 +517,75 @@ def test_references_on_two_continents_are_an_error_that_says_so():
     # Far away, but together, is all right.
     together = LikelihoodField(DEFAULT, [(scan, Pose2D(5e5, 5e6)), (scan, Pose2D(5e5 + 3.0, 5e6))])
     assert len(together.tiles.pages) <= 4
+
+
+def test_what_several_changes_touch_is_derived_once_and_who_reads_first_has_it(monkeypatch):
+    scans, others = placed(2, 7), placed(4, 8)
+    derived = []
+    derive = field_module._derive
+
+    def counted(tiles, *rest):
+        derived.append(len(tiles))
+        derive(tiles, *rest)
+
+    lazy = LikelihoodField(COARSE, scans)
+    monkeypatch.setattr(field_module, "_derive", counted)
+    for scan, pose in others:
+        lazy.add(scan, pose)
+    lazy.remove(*others[0])
+    assert not derived
+    assert all_bytes(lazy) == all_bytes(LikelihoodField(COARSE, [*scans, *others[1:]]))
+    assert derived
+    # Very much is derived by the writer, so that no reader waits for it.
+    monkeypatch.setattr(field_module, "_MOST_WAITING", 1)
+    derived.clear()
+    lazy.add(*others[0])
+    assert derived
+    derived.clear()
+    assert all_bytes(lazy) == all_bytes(LikelihoodField(COARSE, [*scans, *others])) or derived
+
+
+def test_readers_see_whole_changes_while_a_writer_goes_on():
+    scans, others = placed(2, 9), placed(1, 10)
+    field = LikelihoodField(COARSE, scans)
+    scan, pose = others[0]
+    ends = (pose.apply(scan.points[::7]) / COARSE.resolution).astype(int).tolist()
+
+    def seen_by(tiles):
+        return tuple(code_at(tiles, *end) for end in ends)
+
+    without = seen_by(field.tiles)
+    having = seen_by(LikelihoodField(COARSE, [*scans, *others]).tiles)
+    assert without != having
+    seen, done = set(), threading.Event()
+
+    def read():
+        while not done.is_set():
+            seen.add(seen_by(field.tiles))
+
+    reader = threading.Thread(target=read)
+    reader.start()
+    for _ in range(60):
+        field.add(scan, pose)
+        field.remove(scan, pose)
+    done.set()
+    reader.join()
+    assert seen <= {without, having}
+    assert seen_by(field.tiles) == without
+
+
+def test_evidence_that_is_packed_and_opened_again_is_the_same(monkeypatch):
+    scans, others = placed(3, 11), placed(2, 12, Pose2D(60.0, 10.0, 0.3))
+    expected = all_bytes(LikelihoodField(COARSE, [*scans, *others]))
+    monkeypatch.setattr(evidence, "_MOST_OPEN", 6)
+    field = LikelihoodField(COARSE, scans)
+    for _ in range(3):
+        for scan, pose in others:
+            field.add(scan, pose)
+            assert field.tiles
+        for scan, pose in [*others, scans[0]]:
+            field.remove(scan, pose)
+        field.add(*scans[0])
+    for scan, pose in others:
+        field.add(scan, pose)
+    assert all_bytes(field) == expected

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import math
+from dataclasses import astuple
 
 import numpy as np
 import pytest
@@ -25,15 +26,17 @@ def scene(seed, building=""):
     anchors = AnchorPoints(
         rng.uniform(-9.0, 9.0, (count, 2)), rng.integers(0, 5, count), rng.uniform(-3, 3, count), 0
     )
-    return Scene(building, anchors)
+    return Scene(building, anchors, rng.uniform(-9.0, 9.0, (40, 2)))
 
 
 POOL = [scene(k, "office" if k % 3 else "") for k in range(12)]
 
 
 def rows(made):
-    return [(base, a.positions.tobytes(), a.kinds.tobytes(), a.directions.tobytes())
-            for base, a in made]  # fmt: skip
+    return [
+        (base, *(each.tobytes() for each in (*astuple(scene.anchors)[:3], scene.points)))
+        for base, scene in made
+    ]
 
 
 @given(st.integers(0, 99))
@@ -47,8 +50,9 @@ def test_the_first_distractors_are_the_same_whatever_their_number(seed):
 def test_half_of_the_distractors_are_from_real_scans_and_none_is_its_base():
     made = list(distractors(POOL, 400, 3))
     assert sum(bool(POOL[base].building) for base, _ in made) == 200
-    for base, anchors in made:
-        before = POOL[base].anchors
+    for base, scene in made:
+        before, anchors = POOL[base].anchors, scene.anchors
+        assert len(scene.points) == len(POOL[base].points)
         assert np.isin(anchors.kinds, [0, 1, 2, 3, 4]).all()
         # Some relation of the base is longer or shorter than noise makes it, or gone.
         spans = np.ptp(before.positions, axis=0) if len(before) else np.zeros(2)

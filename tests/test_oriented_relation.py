@@ -222,17 +222,46 @@ def test_no_more_database_edges_are_looked_at_than_allowed_and_rare_ones_first(m
     edges, _ = relation.edges(graphs, 0)
     looked_at = []
 
-    def vote(postings, ranges, turns, weights, tallies):
-        found = ranges[:, 1] - ranges[:, 0]
-        looked_at.append((found[weights > 0], found[weights == 0]))
+    def vote(postings, ranges, turns, weights, opening, scratch, count):
+        looked_at.append(ranges[:, 1] - ranges[:, 0])
+        return count
 
     monkeypatch.setattr(oriented_relation, "_vote", vote)
-    relation.counts(graph_of(query), [edges], len(graphs), len(graphs))
-    taken, left = looked_at[0]
+    relation.met(graph_of(query), [edges], len(graphs), len(graphs))
+    taken = looked_at[0]
     assert taken.sum() <= most
-    left = left[left > 0]
-    assert not len(left) or not len(taken) or taken.max() < left.min()
+    relation = OrientedRelation(OrientedSettings(most_edges=10_000))
+    relation.met(graph_of(query), [edges], len(graphs), len(graphs))
+    everything = looked_at[1]
+    assert np.all(np.diff(everything) >= 0)
+    # The rarest ones, all that are as rare as each other or none.
+    assert everything[: len(taken)].tolist() == taken.tolist()
+    left = everything[len(taken) :]
+    assert not len(left) or not len(taken) or taken[-1] < left[0]
     assert (len(left) == 0) == (most == 100_000)
+
+
+@given(st.integers(0, 1 << 30), st.integers(1, 400))
+def test_what_the_rarest_keys_meet_is_counted_in_full_and_nothing_else(seed, opening):
+    query = random_anchors(seed, 7)
+    references = {
+        k: jittered(query, k, 0.1) if k % 2 else random_anchors(seed + k) for k in range(12)
+    }
+    fewer = OrientedSettings(most_edges=10_000, most_opening=opening)
+    count, full = as_dict(votes(query, references, fewer)), as_dict(votes(query, references))
+    missed = [k for k in full if count[k] != full[k]]
+    assert all(count[k] == 0.0 for k in missed)
+    # Before the rarest edge that one has in common with the scan, enough others were looked at.
+    known = {k: [key for key, _ in plain_keys(anchors)] for k, anchors in references.items()}
+    cells = []
+    for key, _, share in plain_cells(query):
+        having = [keys.count(key) for keys in known.values()]
+        if any(having):
+            worth = math.log1p(12 / sum(having)) / math.log1p(12) * share * 256
+            cells.append((sum(having), worth, having))
+    for k in missed:
+        rarest = min(found for found, worth, having in cells if having[k] and worth > 0.6)
+        assert sum(found for found, worth, _ in cells if found <= rarest) >= opening
 
 
 pairs = st.lists(st.tuples(st.integers(0, 40), st.integers(0, 30)), max_size=60)

@@ -24,9 +24,11 @@ from anchorscan import (
     match,
     simulate,
 )
+from anchorscan.anchors import stack_anchors
 from anchorscan.description import describe
 from anchorscan.pairwise import Known
-from anchorscan.placed import lot_of, nearest
+from anchorscan.panorama import panorama, view, worth
+from anchorscan.placed import lot_of, nearest, tidied
 from anchorscan.stitched_map import StitchedMap
 
 DEFAULT = Settings.preset("default")
@@ -254,6 +256,47 @@ def test_the_best_voted_references_propose():
         assert few.proposals.proposed <= everything.proposals.proposed
         all_of_them = PLACES[0].explain(scan, len(references)).in_map
         assert set(all_of_them.votes.references.tolist()) == identifiers
+
+
+def test_a_lot_that_was_emptied_goes_and_the_one_before_it_stays_as_it_is():
+    known = [Known(each, describe(each.scan, DEFAULT)) for each in BUILT[0][0]]
+    many = lot_of(known[:-1], 0, DEFAULT.proposal)
+    one = lot_of(known[-1:], len(many), DEFAULT.proposal)
+    (left,) = tidied([many, one.without(0)])
+    assert left is many
+    (empty,) = tidied([lot_of(known[:1], 0, DEFAULT.proposal).without(0)])
+    assert len(empty) == 0
+
+
+@given(numbers, st.integers(0, 11), st.integers(1, 12))
+@examples(max_examples=20)
+def test_those_that_saw_what_the_scan_sees_propose_first(number, k, most):
+    references, asked = BUILT[number]
+    known = [Known(each, describe(each.scan, DEFAULT)) for each in references]
+    description = describe(asked[k][0], DEFAULT)
+    places = StitchedMap(DEFAULT, known)
+    places.remove(references[3].identifier)
+    places.add(Known(Reference(100, references[3].scan, references[3].pose), known[3].description))
+    left = [*known[:3], *known[4:], known[3]]
+    voted = DEFAULT.changed({"database": {"compared": 0}})
+    votes = StitchedMap(voted, known).search(description, 12).votes
+    quality = dict(zip(votes.references.tolist(), votes.quality.tolist(), strict=True))
+    worths = {
+        each.reference.identifier: worth(
+            view(description.angles.points, description.anchors),
+            stack_anchors([each.description.anchors]),
+            panorama(each.description.angles.points, each.description.anchors.main_angle)[None],
+            np.array([0]),
+            np.array([quality[each.reference.identifier]]),
+            1,
+        )[0]
+        for each in left
+    }
+    worths[100] = worths.pop(references[3].identifier)
+    expected = sorted(worths.values(), reverse=True)[:most]
+    chosen = places.search(description, most).votes.references.tolist()
+    # Equal ones may come in any order.
+    assert [worths[each] for each in chosen] == pytest.approx(expected)
 
 
 def test_references_one_by_one_find_what_they_find_together():

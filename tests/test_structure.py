@@ -25,7 +25,7 @@ ORDER = (
     *("protocol", "journey"),
     *("array_file", "_jit"),
     *("angle_function", "segments", "anchors", "graph"),
-    *("length_relation", "oriented_relation", "database", "alignment"),
+    *("length_relation", "oriented_relation", "database", "panorama", "alignment"),
     *("evidence", "field", "proposal", "verification", "evaluation", "hypothesis", "decision"),
     *("motion", "belief", "settings"),
     *("description", "pairwise", "placed", "stitched_map", "matcher"),

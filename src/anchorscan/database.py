@@ -18,6 +18,7 @@ large merge.  So a reader keeps what it has begun with, and writing costs little
 
 from __future__ import annotations
 
+import math
 import threading
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
@@ -41,8 +42,10 @@ _MERGED_SHARE = 0.25
 _SMALLEST_PART = 4096
 # A reference of fewer edges counts as one of so many oriented ones: few edges prove little.
 _FEWEST_EDGES = 16
-# Up to so many the best are picked in one pass; beyond, all are sorted.
-_FEW = 256
+# The histogram that tells which qualities are among the best: bins of the square root of the
+# quality, and how many of them make one.
+_BINS = 4096
+_BINS_OF_ONE = 2048.0
 
 Number = TypeVar("Number", np.int32, np.int64)
 
@@ -64,6 +67,11 @@ class DatabaseSettings(BaseModel):
     )
     candidates: int | None = Field(
         None, ge=1, description="references that are followed further; null for all"
+    )
+    compared: int = Field(
+        750,
+        ge=0,
+        description="references in a map that are compared by what they saw to choose these",
     )
 
 
@@ -222,12 +230,16 @@ class RelationshipDatabase:
             most: How many references to return; None for all.
         """
         state = self._state
-        counts = self._relation.counts(graph, state.parts, state.used, state.alive)
-        sizes, identifiers = state.sizes[: state.used], state.identifiers[: state.used]
+        slots, counts = self._relation.met(graph, state.parts, state.used, state.alive)
         edges = (self._relation.size(graph), self._fewest)
-        if most is None or most > _FEW:
-            return Votes(*_in_order(counts, sizes, identifiers, edges, most))
-        return Votes(*_best(counts, sizes, identifiers, edges, min(most, state.used)))
+        if most is not None and most < len(slots):
+            chosen = _promising(slots, counts, state.sizes, edges, most)
+            found = _in_order(slots[chosen], counts[chosen], state, edges, most)
+            if len(found[0]) == most:
+                return Votes(*found)
+        everywhere = np.zeros(state.used, np.float32)
+        everywhere[slots] = counts
+        return Votes(*_in_order(np.arange(state.used), everywhere, state, edges, most))
 
     def _beginning(
         self, edges: Any, sizes: NDArray[np.int32], identifiers: NDArray[np.int64]
@@ -273,16 +285,17 @@ def _tidied(parts: list[Any], one_part: bool = False) -> tuple[Any, ...]:
 
 
 def _in_order(
+    slots: NDArray[np.int32] | NDArray[np.int64],
     counts: NDArray[np.float32],
-    sizes: NDArray[np.int32],
-    identifiers: NDArray[np.int64],
+    state: _State,
     edges: tuple[int, int],
     most: int | None,
 ) -> tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.float64]]:
-    """Order all slots by quality: what ``_best`` does, where many are wanted."""
-    alive = np.flatnonzero(sizes >= 0)
-    counts, identifiers = counts[alive], identifiers[alive]
-    pairs = float(edges[0]) * np.maximum(sizes[alive], edges[1])
+    """Order slots by quality: identifiers, counts and qualities of the first ones."""
+    alive = np.flatnonzero(state.sizes[slots] >= 0)
+    slots, counts = slots[alive], counts[alive]
+    identifiers = state.identifiers[slots]
+    pairs = float(edges[0]) * np.maximum(state.sizes[slots], edges[1])
     quality = np.divide(
         counts.astype(np.float64) ** 2, pairs, out=np.zeros(len(alive)), where=pairs > 0
     )
@@ -300,40 +313,30 @@ def _with_room(values: NDArray[Number], slot: int) -> NDArray[Number]:
 
 
 @kernel
-def _best(counts, sizes, identifiers, edges, most):  # type: ignore[no-untyped-def]
-    """The ``most`` slots of highest quality: identifiers, counts and qualities, in order."""
-    quality = np.empty(most)
-    chosen = np.empty(most, np.int64)
+def _promising(slots, counts, sizes, edges, most):  # type: ignore[no-untyped-def]
+    """Places of the ``most`` slots of highest quality, and of some that are about as good.
+
+    A histogram of the square roots tells which quality that many reach, so that nothing is
+    sorted but the few that are left.
+    """
+    scale = np.empty(len(counts), np.int32)
+    reached = np.zeros(_BINS, np.int64)
+    for k in range(len(slots)):
+        size = sizes[slots[k]]
+        if size < 0 or edges[0] == 0:
+            scale[k] = -1
+            continue
+        root = counts[k] / math.sqrt(np.float64(edges[0]) * max(size, edges[1], 1))
+        scale[k] = min(int(root * _BINS_OF_ONE), _BINS - 1)
+        reached[scale[k]] += 1
+    least, enough = _BINS, 0
+    while least > 0 and enough < most:
+        least -= 1
+        enough += reached[least]
+    chosen = np.empty(enough, np.int64)
     found = 0
-    enough = 0.0
-    for slot in range(len(sizes)):
-        if sizes[slot] < 0 or most == 0:
-            continue
-        count = np.float64(counts[slot])
-        pairs = np.float64(edges[0]) * max(sizes[slot], edges[1])
-        # Nearly all of a large set are passed over here, without a division.
-        if count * count < enough * pairs:
-            continue
-        q = count**2 / pairs if pairs > 0.0 else 0.0
-        if found == most:
-            worst = chosen[found - 1]
-            if q < quality[found - 1] or (
-                q == quality[found - 1] and identifiers[slot] > identifiers[worst]
-            ):
-                continue
-            found -= 1
-        k = found
-        while k > 0 and (
-            quality[k - 1] < q
-            or (quality[k - 1] == q and identifiers[chosen[k - 1]] > identifiers[slot])
-        ):
-            quality[k] = quality[k - 1]
-            chosen[k] = chosen[k - 1]
-            k -= 1
-        quality[k] = q
-        chosen[k] = slot
-        found += 1
-        if found == most:
-            enough = quality[found - 1] * (1.0 - 1e-9)
-    chosen = chosen[:found]
-    return identifiers[chosen], counts[chosen], quality[:found]
+    for k in range(len(slots)):
+        if scale[k] >= least:
+            chosen[found] = k
+            found += 1
+    return chosen[:found]

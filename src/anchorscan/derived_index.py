@@ -56,7 +56,7 @@ _FORMAT = 1
 # the version.
 _STAGES = (
     *("__init__", "scan", "angle_function", "segments", "anchors", "graph"),
-    *("length_relation", "oriented_relation", "database"),
+    *("length_relation", "oriented_relation", "database", "panorama"),
     *("evidence", "field", "proposal", "placed"),
 )
 _SECTIONS = ("method", "anchors", "graph", "database", "field")
@@ -72,7 +72,12 @@ _FLOATS = (
     *("anchors.main_angles", "landmarks.positions"),
 )
 _OTHERS = {
-    **{"scans.ranges": np.float32, "scans.sensors": np.int32, "names.text": np.uint8},
+    **{
+        "scans.ranges": np.float32,
+        "references.panoramas": np.uint8,
+        "scans.sensors": np.int32,
+        "names.text": np.uint8,
+    },
     **{"landmarks.directions": np.int16, "landmarks.turns": np.int16},
     **{"landmarks.edges": np.int32, "landmarks.lengths": np.float32},
     **{"field.squares": np.int32, "field.codes": np.uint8, "field.coarse": np.int8},

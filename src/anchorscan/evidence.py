@@ -80,6 +80,8 @@ class TileEvidence:
             raise ValueError("the evidence of the map does not fit its tiles")
         self._packed: dict[int, bytes] = {}
         self._open: dict[int, int] = {}
+        # Those that were opened to be changed: others need not be packed again.
+        self._changed: set[int] = set()
         self._layers = Evidence(*(np.zeros((1, SIDE, SIDE), np.int32) for _ in range(_LAYERS)))
 
     @property
@@ -92,7 +94,8 @@ class TileEvidence:
 
         Args:
             squares: (N, 2) row and column.
-            make: Whether to begin tiles that are not there; their row is 0 otherwise.
+            make: Whether they are to be changed, and to begin tiles that are not there; the row
+                of these is 0 otherwise.
 
         Returns:
             (N,) row of each in ``layers``.
@@ -101,6 +104,8 @@ class TileEvidence:
             AnchorscanError: Stored evidence is damaged.
         """
         keys = _keys(squares).tolist()
+        if make:
+            self._changed.update(keys)
         closed = list(dict.fromkeys(key for key in keys if key not in self._open))
         if closed:
             self._load(closed, keys, make)
@@ -137,8 +142,9 @@ class TileEvidence:
         """Pack all open tiles but those that are wanted, and move these together."""
         kept = [key for key in self._open if key in wanted]
         for key, row in self._open.items():
-            if key not in wanted:
+            if key not in wanted and key in self._changed:
                 self._packed[key] = self._pack(row)
+                self._changed.remove(key)
         rows = [0, *(self._open[key] for key in kept)]
         self._layers = Evidence(*(layer[rows] for layer in self._layers))
         self._open = {key: row for row, key in enumerate(kept, 1)}
@@ -147,8 +153,13 @@ class TileEvidence:
         need = len(self._open) + 1 + count
         have = len(self._layers.hits)
         if need > have:
-            room = np.zeros((max(need, 2 * have) - have, SIDE, SIDE), np.int32)
-            self._layers = Evidence(*(np.concatenate([layer, room]) for layer in self._layers))
+            # Zeros take no memory until they are written to: growing once is better than often.
+            room = max(need, 2 * have, _MOST_OPEN + 1)
+            grown = Evidence(*(np.zeros((room, SIDE, SIDE), np.int32) for _ in range(_LAYERS)))
+            used = len(self._open) + 1
+            for layer, values in zip(grown, self._layers, strict=True):
+                layer[:used] = values[:used]
+            self._layers = grown
 
     def _packed_one(self, key: int) -> bytes:
         row = self._open.get(key)

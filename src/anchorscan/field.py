@@ -22,11 +22,15 @@ that is a few decimetres off can be told from a wrong one with a handful of look
 Tiles are found through a table of squares, in pages of 64 x 64 squares.  Whoever reads keeps the
 map that was there when reading began: a change writes new versions of the tiles and pages that
 it touches, and no others, so that its price does not grow with the map.
+
+Bytes are derived when the map is next read: what several changes have touched is derived once.
+When very much has been touched, the change itself derives it, so that no reader waits for long.
 """
 
 from __future__ import annotations
 
 import math
+import threading
 from collections.abc import Iterable, Iterator
 from typing import NamedTuple
 
@@ -54,6 +58,8 @@ _CLEAR = 0.2
 _PAGE = 64  # squares along a side of a page of the table
 # So many pages cover fifty kilometres times fifty with cells of 5 cm.
 _MOST_PAGES = 1 << 16
+# So many squares at most wait to be derived: about fifty milliseconds for the next reader.
+_MOST_WAITING = 512
 # Tiles whose evidence is worked on at once, and rays that are deposited at once.
 _GROUP = 1024
 _MANY_RAYS = 1 << 14
@@ -234,15 +240,26 @@ class LikelihoodField:
         self._codes, self._coarse = codes, coarse
         self._used = self._published = used
         self._live = 0
+        # Squares with blocks that wait to be derived, as ``_deposit`` tells them.
+        self._changing = threading.RLock()
+        self._waiting: dict[tuple[int, int], NDArray[np.uint64]] = {}
         self._publish()
 
     @property
     def tiles(self) -> Tiles:
         """The map as kernels read it; it stays as it is when others add and remove."""
+        if self._waiting:
+            with self._changing:
+                self._derive_waiting()
         return self._tiles
 
     def arrays(self) -> FieldArrays:
         """Return the map as plain arrays, all that ``from_arrays`` needs."""
+        with self._changing:
+            self._derive_waiting()
+            return self._arrays()
+
+    def _arrays(self) -> FieldArrays:
         pages = np.argwhere(self._pages)
         rows, columns, tiles = [], [], []
         for i, j in pages.tolist():
@@ -278,10 +295,29 @@ class LikelihoodField:
         self._change(scan, pose, -1)
 
     def _change(self, scan: LaserScan, pose: Pose2D, sign: int) -> None:
-        for rays in self._batches([(scan, pose)]):
-            touched, dirty = self._deposit(rays, sign)
-            self._derive(touched, dirty)
-            self._publish()
+        with self._changing:
+            for rays in self._batches([(scan, pose)]):
+                touched, dirty = self._deposit(rays, sign)
+                # Opened here, since damaged evidence is the writer's to hear of.
+                self._evidence.rows(self._around(touched), make=False)
+                for square, blocks in zip(map(tuple, touched.tolist()), dirty, strict=True):
+                    if square in self._waiting:
+                        self._waiting[square] |= blocks
+                    else:
+                        self._waiting[square] = blocks
+            if len(self._waiting) > _MOST_WAITING:
+                self._derive_waiting()
+
+    def _derive_waiting(self) -> None:
+        """Bring the map up to date for readers."""
+        if not self._waiting:
+            return
+        squares = np.array(sorted(self._waiting), np.int64)
+        dirty = np.array([self._waiting[square] for square in map(tuple, squares.tolist())])
+        for first in range(0, len(squares), _GROUP):
+            self._derive(squares[first : first + _GROUP], dirty[first : first + _GROUP])
+        self._publish()
+        self._waiting = {}
 
     def _publish(self) -> None:
         row, column = self._corner
@@ -381,10 +417,7 @@ class LikelihoodField:
     def _derive(self, squares: NDArray[np.int64], dirty: NDArray[np.uint64]) -> None:
         """Bring the bytes of dirty blocks up to date, in new versions of their tiles."""
         settings = self._settings
-        wide = -(-self._halo // _SIDE)
-        steps = np.arange(-wide, wide + 1)
-        near = np.stack(np.meshgrid(steps, steps, indexing="ij"), axis=-1).reshape(-1, 2)
-        around = (squares[:, np.newaxis] + near).reshape(-1, 2)
+        around = self._around(squares)
         rows = self._evidence.rows(around, make=False).reshape(len(squares), -1)
         limits = (
             settings.resolution,
@@ -396,6 +429,13 @@ class LikelihoodField:
         tiles = self._renewed(squares)
         _derive(tiles, rows, dirty, self._evidence.layers, self._codes, limits)
         _pool(tiles, dirty, self._codes, self._coarse, self._weights)
+
+    def _around(self, squares: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Squares with those within reach of them, one behind the other."""
+        wide = -(-self._halo // _SIDE)
+        steps = np.arange(-wide, wide + 1)
+        near = np.stack(np.meshgrid(steps, steps, indexing="ij"), axis=-1).reshape(-1, 2)
+        return (squares[:, np.newaxis] + near).reshape(-1, 2)
 
     def _renewed(self, squares: NDArray[np.int64]) -> NDArray[np.int32]:
         """Give squares tiles that nobody reads yet, with what theirs held before."""

@@ -4,10 +4,11 @@ Real queries are asked for the references of their place (P1 and P3 of ``protoco
 among more and more *distractors*: references of other places, which must not take their rank.
 
 Distractors are made from real scans and from scans of simulated buildings, half of each.  The
-anchor points of a scan, in the frame of its main walls, are stretched along each wall by a factor
-from 0.74 to 1.35, by at least 5 % along one of them; half are mirrored; 15 % of the anchor points
-are lost and about as many come from another scan; positions and directions get noise of 3 cm and
-0.03 radians.  So the relations within a distractor are those of rooms and corridors, and no
+anchor points and readings of a scan, in the frame of its main walls, are stretched along each
+wall by a factor from 0.74 to 1.35, by at least 5 % along one of them; half are mirrored; 15 % of
+the anchor points and a sector of 15 % of the readings are lost and about as many come from
+another scan; positions and directions get noise of 3 cm and 0.03 radians.
+So the relations within a distractor are those of rooms and corridors, and no
 distractor is the place itself.  For a query only distractors count that were not made from its
 own building: those that were, about a twelfth, are passed over in the answer.
 
@@ -34,13 +35,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .anchors import AnchorPoints
+from .anchors import AnchorPoints, AnchorStack, stack_anchors
 from .array_file import read_arrays, write_arrays
-from .database import RelationshipDatabase
+from .database import RelationshipDatabase, Votes
 from .description import Description, describe
 from .errors import AnchorscanError, MissingExtraError
 from .field import LikelihoodField
 from .graph import AnchorGraph
+from .panorama import DIRECTIONS, panorama, reordered, view, worth
 from .pose import Pose2D
 from .proposal import joined, landmarks, proposals
 from .protocol import CORRECT_HEADING, CORRECT_POSITION, thin
@@ -66,6 +68,8 @@ _REAL_SCANS, _SIMULATED_SCANS = 400, 40
 # Identifiers of distractors begin beyond those of any place.
 _FIRST_DISTRACTOR = 1 << 40
 _CHANGES = 400
+# So many distractors are made to warm up.
+_WARMING = 20
 # So many distractors of the query's own building may have to be passed over.
 _PASSED_OVER = 60
 
@@ -243,7 +247,7 @@ def measure(
     say(f"{sum(len(each.queries) for each in asked)} queries in {len(asked)} places")
     pool = _pool(places, settings, buildings, seed)
     say(f"{len(pool)} scans to make distractors from")
-    _warm_up(asked[0], settings)
+    _warm_up(asked, settings, pool)
     measured = []
     for count in (0, *sizes):
         measured.append(_measured(count, asked, pool, settings, seed))
@@ -251,17 +255,9 @@ def measure(
     return Growth(tuple(measured), sum(len(each.queries) for each in asked), seed)
 
 
-def _warm_up(asked: _Asked, settings: Settings) -> None:
+def _warm_up(asked: Sequence[_Asked], settings: Settings, pool: Sequence[Scene]) -> None:
     """Compile all that is timed."""
-    graphs = [known.graph for known in asked.known[:2]] * 3
-    database = RelationshipDatabase(settings.database, enumerate(graphs))
-    arrays = database.arrays()
-    for array in arrays.values():
-        array.flags.writeable = False  # as mapped ones are: kernels are compiled for these apart
-    database = RelationshipDatabase.from_arrays(settings.database, arrays)
-    database.add(len(graphs), graphs[0])
-    database.votes(graphs[0], RANKS[-1])
-    database.remove(0)
+    _measured(_WARMING, [_Asked(asked[0].place, settings, [0])], pool, settings, 0)
 
 
 def slope(counts: Sequence[float], milliseconds: Sequence[float]) -> float:
@@ -278,10 +274,27 @@ class Scene:
     Args:
         building: Empty for a simulated one.
         anchors: With the main angle zero.
+        points: (N, 2) end points of its readings in the same frame.
     """
 
     building: str
     anchors: AnchorPoints
+    points: NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class _Seen:
+    """What references are compared by.
+
+    Args:
+        anchors: Their anchor points.
+        panoramas: (N, 180) uint8.
+        bases: (N,) which scene each distractor was made from.
+    """
+
+    anchors: AnchorStack
+    panoramas: NDArray[np.uint8]
+    bases: NDArray[np.int32]
 
 
 class _Asked:
@@ -289,10 +302,16 @@ class _Asked:
 
     def __init__(self, place: Place, settings: Settings, chosen: Sequence[int]) -> None:
         self.place = place
+        self.compared = settings.database.compared
         self.known = [describe(each.scan, settings) for each in place.references]
         self.poses = np.array([_pose(each).to_array() for each in place.references])
         self.queries = [place.queries[k] for k in chosen]
         self.described = [describe(scan, settings) for scan, _ in self.queries]
+        self.seen = _Seen(
+            stack_anchors([known.anchors for known in self.known]),
+            np.array([panorama(d.angles.points, d.anchors.main_angle) for d in self.known]),
+            np.empty(0, np.int32),
+        )
         scans = ((each.scan, _pose(each)) for each in place.references)
         self._tiles = LikelihoodField(settings.field, scans).tiles
         self._weights = settings.field.weights()
@@ -343,25 +362,25 @@ def _pool(places: Sequence[Place], settings: Settings, buildings: int, seed: int
         world = random_building(seed + number)
         for pose in random_poses(world, _SIMULATED_SCANS, seed + number):
             found.append(("", simulate(world, pose, sensor, rng)))
-    scenes = [
-        Scene(building, _upright(describe(scan, settings).anchors)) for building, scan in found
-    ]
+    scenes = [_scene(building, describe(scan, settings)) for building, scan in found]
     return [scene for scene in scenes if len(scene.anchors) >= _FEWEST_ANCHORS]
 
 
-def _upright(anchors: AnchorPoints) -> AnchorPoints:
-    """Anchor points in the frame of their main walls."""
+def _scene(building: str, description: Description) -> Scene:
+    """Anchor points and readings in the frame of their main walls."""
+    anchors = description.anchors
     main = anchors.main_angle if math.isfinite(anchors.main_angle) else 0.0
     c, s = math.cos(main), math.sin(main)
-    positions = anchors.positions @ np.array([[c, -s], [s, c]])
-    return AnchorPoints(positions, anchors.kinds, anchors.directions - main, 0.0)
+    upright = np.array([[c, -s], [s, c]])
+    turned = AnchorPoints(anchors.positions @ upright, anchors.kinds, anchors.directions - main, 0)
+    return Scene(building, turned, description.angles.points @ upright)
 
 
-def distractors(pool: Sequence[Scene], count: int, seed: int) -> Iterator[tuple[int, AnchorPoints]]:
+def distractors(pool: Sequence[Scene], count: int, seed: int) -> Iterator[tuple[int, Scene]]:
     """Make references of other places; the first are the same whatever their number.
 
     Yields:
-        Which scene of the pool each was made from, and its anchor points.
+        Which scene of the pool each was made from, and what it has become.
     """
     rng = np.random.default_rng([seed, 1])
     halves = [
@@ -372,11 +391,12 @@ def distractors(pool: Sequence[Scene], count: int, seed: int) -> Iterator[tuple[
     for number in range(count):
         half = halves[number % len(halves)]
         base, other = half[rng.integers(len(half))], half[rng.integers(len(half))]
-        yield base, _perturbed(pool[base].anchors, pool[other].anchors, rng)
+        yield base, _perturbed(pool[base], pool[other], rng)
 
 
-def _perturbed(base: AnchorPoints, other: AnchorPoints, rng: np.random.Generator) -> AnchorPoints:
-    """Anchor points of a place that is not the base's, but as likely."""
+def _perturbed(scene: Scene, another: Scene, rng: np.random.Generator) -> Scene:
+    """Make a place that is not the scene's, but as likely."""
+    base, other = scene.anchors, another.anchors
     stretch = rng.uniform(-_STRETCH, _STRETCH, 2)
     if np.abs(stretch).max() < _LEAST_STRETCH:
         stretch[rng.integers(2)] = _LEAST_STRETCH
@@ -387,10 +407,25 @@ def _perturbed(base: AnchorPoints, other: AnchorPoints, rng: np.random.Generator
     directions = np.concatenate([base.directions[kept], other.directions[taken]])
     positions += rng.normal(0.0, _POSITION_NOISE, positions.shape)
     directions = directions + rng.normal(0.0, _DIRECTION_NOISE, len(directions))
-    if rng.random() < 0.5:
+    is_mirrored = rng.random() < 0.5
+    points = _with_sector_of(another.points, scene.points * np.exp(stretch), rng)
+    points += rng.normal(0.0, _POSITION_NOISE, 2)
+    if is_mirrored:
         positions[:, 1] *= -1.0
+        points[:, 1] *= -1.0
         directions, kinds = -directions, _MIRRORED[kinds]
-    return AnchorPoints(positions, kinds, directions, 0.0)
+    return Scene(scene.building, AnchorPoints(positions, kinds, directions, 0.0), points)
+
+
+def _with_sector_of(
+    others: NDArray[np.float64], points: NDArray[np.float64], rng: np.random.Generator
+) -> NDArray[np.float64]:
+    """Replace some readings that lie side by side by as many of another scan."""
+    lost = int(_LOST * len(points))
+    taken = min(lost, len(others))
+    first = int(rng.integers(len(points) - lost + 1))
+    other = int(rng.integers(len(others) - taken + 1))
+    return np.concatenate([points[:first], points[first + lost :], others[other : other + taken]])
 
 
 def _graph(anchors: AnchorPoints) -> AnchorGraph:
@@ -405,27 +440,24 @@ def _measured(
     count: int, asked: Sequence[_Asked], pool: Sequence[Scene], settings: Settings, seed: int
 ) -> Size:
     """Measure among one number of distractors."""
-    bases = np.empty(count, np.int32)
-
-    def numbered() -> Iterator[tuple[int, AnchorGraph]]:
-        for number, (base, anchors) in enumerate(distractors(pool, count, seed)):
-            bases[number] = base
-            yield _FIRST_DISTRACTOR + number, _graph(anchors)
-
-    database = RelationshipDatabase(settings.database, numbered())
+    made = _Made(count)
+    database = RelationshipDatabase(
+        settings.database,
+        ((_FIRST_DISTRACTOR + n, _graph(a)) for n, a in made.all(distractors(pool, count, seed))),
+    )
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "relations"
         arrays = database.arrays()
-        write_arrays(path, arrays, "growth")
+        write_arrays(path, arrays | made.arrays(), "growth")
         size, edges = path.stat().st_size, int(arrays["sizes"].sum())
-        del database, arrays
+        del database, arrays, made
         start = time.perf_counter()
-        database = _opened(path, settings)
-        database.votes(asked[0].described[0].graph, RANKS[-1])
+        database, crowd = _opened(path, settings)
+        _Search(database, crowd, asked[0]).votes(asked[0].described[0])
         opening = time.perf_counter() - start
         buildings = [scene.building for scene in pool]
-        rounds = [_Round(database, each, bases, buildings) for each in asked]
-        changing = _while_changing(database, asked)
+        rounds = [_Round(database, each, crowd, buildings) for each in asked]
+        changing = _while_changing(database, crowd, asked)
     times = np.concatenate([each.milliseconds for each in rounds])
     ranks = np.concatenate([each.ranks for each in rounds])
     located = np.concatenate([each.located for each in rounds])
@@ -449,11 +481,83 @@ def _measured(
     )
 
 
-def _opened(path: Path, settings: Settings) -> RelationshipDatabase:
+class _Made:
+    """What is kept of distractors: the database keeps the edges."""
+
+    def __init__(self, count: int) -> None:
+        self._bases = np.empty(count, np.int32)
+        self._panoramas = np.empty((count, DIRECTIONS), np.uint8)
+        self._anchors: list[tuple[NDArray[Any], ...]] = []
+
+    def all(self, scenes: Iterator[tuple[int, Scene]]) -> Iterator[tuple[int, AnchorPoints]]:
+        """Keep what each is compared by, and pass on its number and its anchor points."""
+        for number, (base, scene) in enumerate(scenes):
+            self._bases[number] = base
+            self._panoramas[number] = panorama(scene.points, 0.0)
+            anchors = scene.anchors
+            self._anchors.append(
+                (
+                    anchors.positions.astype(np.float32),
+                    anchors.kinds.astype(np.uint8),
+                    anchors.directions.astype(np.float32),
+                )
+            )
+            yield number, anchors
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """Plain arrays by name."""
+        positions, kinds, directions = (
+            np.concatenate([_NONE[k], *(each[k] for each in self._anchors)]) for k in range(3)
+        )
+        starts = np.cumsum([0, *(len(each[1]) for each in self._anchors)], dtype=np.int64)
+        return {
+            "seen.bases": self._bases,
+            "seen.panoramas": self._panoramas,
+            "seen.positions": positions,
+            "seen.kinds": kinds,
+            "seen.directions": directions,
+            "seen.main_angles": np.zeros(len(self._bases), np.float32),
+            "seen.starts": starts,
+        }
+
+
+_NONE = (np.empty((0, 2), np.float32), np.empty(0, np.uint8), np.empty(0, np.float32))
+
+
+def _opened(path: Path, settings: Settings) -> tuple[RelationshipDatabase, _Seen]:
     arrays = read_arrays(path, "growth")
     if arrays is None:
         raise OSError(f"{path} was written and cannot be read")
-    return RelationshipDatabase.from_arrays(settings.database, arrays)
+    stack = ("positions", "kinds", "directions", "main_angles", "starts")
+    crowd = _Seen(
+        AnchorStack(*(arrays[f"seen.{name}"] for name in stack)),
+        arrays["seen.panoramas"],
+        arrays["seen.bases"],
+    )
+    return RelationshipDatabase.from_arrays(settings.database, arrays), crowd
+
+
+class _Search:
+    """The search for candidates as the stitched map does it, distractors included."""
+
+    def __init__(self, database: RelationshipDatabase, crowd: _Seen, asked: _Asked) -> None:
+        self._database, self._crowd, self._asked = database, crowd, asked
+
+    def votes(self, description: Description) -> Votes:
+        """The best candidates for a scan, best first."""
+        most, compared = RANKS[-1] + _PASSED_OVER, self._asked.compared
+        votes = self._database.votes(description.graph, max(most, compared))
+        first, quality = votes.references[:compared], votes.quality[:compared]
+        seen = view(description.angles.points, description.anchors)
+        worths = np.empty(len(first))
+        of_crowd = first >= _FIRST_DISTRACTOR
+        for known, those, begin in (
+            (self._crowd, of_crowd, _FIRST_DISTRACTOR),
+            (self._asked.seen, ~of_crowd, 0),
+        ):
+            asked = (first[those] - begin, quality[those], most)
+            worths[those] = worth(seen, known.anchors, known.panoramas, *asked)
+        return reordered(votes, worths, most)
 
 
 class _Round:
@@ -463,7 +567,7 @@ class _Round:
         self,
         database: RelationshipDatabase,
         asked: _Asked,
-        bases: NDArray[np.int32],
+        crowd: _Seen,
         buildings: Sequence[str],
     ) -> None:
         start = time.thread_time()
@@ -471,15 +575,17 @@ class _Round:
             database.add(number, known.graph)
         self.adding = (time.thread_time() - start) * 1e3 / len(asked.known)
         own = np.array([building == asked.place.building for building in buildings])
+        search = _Search(database, crowd, asked)
         times, ranks, located = [], [], []
         for description, (_, truth) in zip(asked.described, asked.queries, strict=True):
             start = time.thread_time()
-            votes = database.votes(description.graph, RANKS[-1] + _PASSED_OVER)
+            votes = search.votes(description)
             times.append((time.thread_time() - start) * 1e3)
             numbers = votes.references
             is_distractor = numbers >= _FIRST_DISTRACTOR
             passed_over = np.zeros(len(numbers), np.bool_)
-            passed_over[is_distractor] = own[bases[numbers[is_distractor] - _FIRST_DISTRACTOR]]
+            bases = crowd.bases[numbers[is_distractor] - _FIRST_DISTRACTOR]
+            passed_over[is_distractor] = own[bases]
             numbers = numbers[~passed_over][: RANKS[-1]]
             right = np.flatnonzero(np.isin(numbers, np.flatnonzero(asked.right(truth))))
             ranks.append(int(right[0]) if len(right) else RANKS[-1])
@@ -494,7 +600,7 @@ class _Round:
         self.located = np.array(located)
 
 
-def _while_changing(database: RelationshipDatabase, asked: Sequence[_Asked]) -> float:
+def _while_changing(database: RelationshipDatabase, crowd: _Seen, asked: Sequence[_Asked]) -> float:
     """Median milliseconds of a search while another thread adds and removes."""
     graphs = [known.graph for each in asked for known in each.known]
     done = threading.Event()
@@ -512,6 +618,7 @@ def _while_changing(database: RelationshipDatabase, asked: Sequence[_Asked]) -> 
     times = []
     try:
         for each in asked:
+            # References that the writer has added are of all places: these are not compared.
             for description in islice(each.described, 10):
                 start = time.thread_time()
                 database.votes(description.graph, RANKS[-1])

@@ -123,10 +123,12 @@ class LengthRelation:
         """Return the number of edges of a graph."""
         return len(graph)
 
-    def counts(
+    def met(
         self, graph: AnchorGraph, parts: Sequence[EdgesByLength], used: int, alive: int
-    ) -> NDArray[np.float32]:
-        """Count the corresponding edges of every slot: n_m.
+    ) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
+        """Count the corresponding edges, n_m, of those slots that have any.
+
+        Every length occurs everywhere, so nearly all have.
 
         Args:
             graph: Of the scan that is looked for.
@@ -135,14 +137,15 @@ class LengthRelation:
             alive: References among them that count; length alone takes no notice.
 
         Returns:
-            (used,) n_m; valid until this thread counts again.
+            (M,) slots and (M,) n_m.
         """
         counts, cursors = self._scratch_of(used)
         for part in parts:
             if len(part):
                 arrays = (part.lengths, part.slots, part.starts)
                 _count(graph.lengths, arrays, self._tolerance, counts, cursors)
-        return counts
+        slots = np.flatnonzero(counts).astype(np.int32)
+        return slots, counts[slots]
 
     def _scratch_of(self, used: int) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
         """Return zeroed counters of this thread, so that a query allocates none."""

@@ -32,7 +32,7 @@ import threading
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,7 +51,8 @@ _QUARTER = _SECTORS // 4
 _TURNS = 4
 _TURN_BITS = 2
 # Tallies are 16-bit integers: a sum of weights that does not depend on their order.
-_FULL = (1 << 16) - 1
+_TALLY_BITS = 16
+_FULL = (1 << _TALLY_BITS) - 1
 _FINEST_UNIT = 256
 _EXPECTED_TOTAL = 30_000
 # References whose edges are put together at once.
@@ -77,6 +78,9 @@ class OrientedSettings(BaseModel):
     most_edges: int = Field(256, ge=1, description="edges that are kept of one reference")
     most_votes: int = Field(
         500_000, ge=1, description="database edges looked at; the commonest keys go first"
+    )
+    most_opening: int = Field(
+        75_000, ge=1, description="the rarest ones; others count for references that these met"
     )
 
 
@@ -167,6 +171,22 @@ class EdgesByKey:
         return found
 
 
+class _Scratch(NamedTuple):
+    """What one thread counts with, as long as the largest set that it has searched.
+
+    Args:
+        tallies: (N,) uint64, the four of every slot side by side; clear between searches.
+        is_met: A bit for every slot; clear between searches, too.
+        slots: (N,) those that were met.
+        counts: (N,) n_m of those.
+    """
+
+    tallies: NDArray[np.uint64]
+    is_met: NDArray[np.uint64]
+    slots: NDArray[np.int32]
+    counts: NDArray[np.float32]
+
+
 class OrientedRelation:
     """Edges correspond by vector, kinds and directions.
 
@@ -217,10 +237,13 @@ class OrientedRelation:
         lengths = graph.lengths
         return int(((lengths >= settings.shortest_edge) & (lengths <= settings.longest_edge)).sum())
 
-    def counts(
+    def met(
         self, graph: AnchorGraph, parts: Sequence[EdgesByKey], used: int, alive: int
-    ) -> NDArray[np.float32]:
-        """Count the corresponding edges of every slot, by rarity: n_m.
+    ) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
+        """Count the corresponding edges by rarity, n_m, of those slots that have any.
+
+        The work is bounded by ``most_votes``, however many references there are: nothing as
+        long as the set is cleared or looked through.
 
         Args:
             graph: Of the scan that is looked for.
@@ -229,7 +252,8 @@ class OrientedRelation:
             alive: References among them that count.
 
         Returns:
-            (used,) n_m; valid until this thread counts again.
+            (M,) slots in the order in which they were met, and (M,) n_m; valid until this
+            thread counts again.
         """
         settings = self._settings
         tolerances = (
@@ -245,11 +269,25 @@ class OrientedRelation:
         rarity[found == 0] = 0.0
         rarity[self._too_common(found)] = 0.0
         weights = np.round(rarity * shares * unit).astype(np.uint16)
-        tallies, counts = self._scratch_of(used)
+        order, opening = self._rarest_first(found, weights)
+        scratch = self._scratch_of(used)
+        count = 0
         for part, of_part in zip(parts, ranges, strict=True):
-            _vote(part.postings, of_part, turns, weights, tallies)
-        _strength(tallies, 1.0 / unit, counts)
-        return counts
+            keys = (of_part[order], turns[order], weights[order])
+            count = _vote(part.postings, *keys, opening, scratch, count)
+        _strength(scratch, 1.0 / unit, count)
+        self._scratch.all_clear = scratch
+        return scratch.slots[:count], scratch.counts[:count]
+
+    def _rarest_first(
+        self, found: NDArray[np.int64], weights: NDArray[np.uint16]
+    ) -> tuple[NDArray[np.int64], int]:
+        """Order keys that count by their number of edges, and tell how many of them open."""
+        order = np.argsort(found, kind="stable")
+        order = order[weights[order] > 0]
+        before = np.cumsum(found[order]) - found[order]
+        opening = int(np.searchsorted(before, self._settings.most_opening))
+        return order, opening
 
     def _too_common(self, found: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Mark the commonest keys where all together are more than may be looked at."""
@@ -260,16 +298,21 @@ class OrientedRelation:
         within = int(np.searchsorted(np.cumsum(ordered), most, side="right"))
         return np.asarray(found >= ordered[within])
 
-    def _scratch_of(self, used: int) -> tuple[NDArray[np.uint16], NDArray[np.float32]]:
-        """Return zeroed tallies of this thread, so that a query allocates none."""
-        counts = getattr(self._scratch, "counts", None)
-        if counts is None or len(counts) < used:
-            counts = np.empty(max(2 * used, 64), np.float32)
-            self._scratch.counts = counts
-            self._scratch.tallies = np.empty(_TURNS * len(counts), np.uint16)
-        tallies = self._scratch.tallies[: _TURNS * used]
-        tallies.fill(0)
-        return tallies, counts[:used]
+    def _scratch_of(self, used: int) -> _Scratch:
+        """Return clear tallies of this thread, so that a query allocates none.
+
+        They are given back when they are clear again: an interrupted query leaves none behind.
+        """
+        scratch: _Scratch | None = self._scratch.__dict__.pop("all_clear", None)
+        if scratch is None or len(scratch.slots) < used:
+            room = max(2 * used, 64)
+            scratch = _Scratch(
+                np.zeros(room, np.uint64),
+                np.zeros(room // 64 + 1, np.uint64),
+                np.empty(room, np.int32),
+                np.empty(room, np.float32),
+            )
+        return scratch
 
 
 _NOTHING = np.empty(0, np.uint32)
@@ -438,28 +481,47 @@ def _fit_together(keys, starts, postings, slots):  # type: ignore[no-untyped-def
 
 
 @kernel
-def _vote(postings, ranges, turns, weights, tallies):  # type: ignore[no-untyped-def]
-    """Add weights to the tallies of slots and quarter turns between edge and query."""
-    low = np.uint32(_TURNS - 1)
+def _vote(postings, ranges, turns, weights, opening, scratch, count):  # type: ignore[no-untyped-def]
+    """Add weights to the tallies of slots, by the quarter turns between edge and query.
+
+    Slots that the first ``opening`` keys meet are noted, other keys count for these alone;
+    returns how many are noted now.
+    """
+    tallies, is_met, slots = scratch.tallies, scratch.is_met, scratch.slots
     for c in range(len(ranges)):
-        weight = np.uint32(weights[c])
-        if weight == 0:
-            continue
+        weight = np.uint64(weights[c])
         turn = np.uint32(turns[c])
         for e in range(ranges[c, 0], ranges[c, 1]):
             posting = postings[e]
-            at = (posting & ~low) | ((posting - turn) & low)
-            tallies[at] = min(tallies[at] + weight, np.uint32(_FULL))
+            slot = posting >> np.uint32(_TURN_BITS)
+            word, bit = slot >> np.uint32(6), np.uint64(1) << np.uint64(slot & np.uint32(63))
+            # The bits are few enough to stay in the processor; most edges end here.
+            if not is_met[word] & bit:
+                if c >= opening:
+                    continue
+                is_met[word] |= bit
+                slots[count] = slot
+                count += 1
+            shift = np.uint64(((posting - turn) & np.uint32(_TURNS - 1)) * np.uint32(_TALLY_BITS))
+            tally = tallies[slot]
+            room = np.uint64(_FULL) - ((tally >> shift) & np.uint64(_FULL))
+            tallies[slot] = tally + (min(weight, room) << shift)
+    return count
 
 
 @kernel
-def _strength(tallies, unit, counts):  # type: ignore[no-untyped-def]
-    """The largest of the four tallies of every slot."""
-    for slot in range(len(counts)):
-        best = tallies[_TURNS * slot]
-        for turn in range(1, _TURNS):
-            best = max(best, tallies[_TURNS * slot + turn])
-        counts[slot] = best * unit
+def _strength(scratch, unit, count):  # type: ignore[no-untyped-def]
+    """The largest of the four tallies of every slot that was met; clears them."""
+    for k in range(count):
+        slot = scratch.slots[k]
+        tally = scratch.tallies[slot]
+        scratch.tallies[slot] = 0
+        scratch.is_met[slot >> 6] = 0
+        best = np.uint64(0)
+        for _ in range(_TURNS):
+            best = max(best, tally & np.uint64(_FULL))
+            tally >>= np.uint64(_TALLY_BITS)
+        scratch.counts[k] = best * unit
 
 
 @kernel

@@ -25,6 +25,7 @@ from ._jit import kernel
 from .anchors import AnchorKind, AnchorStack, stack_anchors
 from .angle_function import wrapped
 from .pairwise import Known
+from .panorama import DIRECTIONS, panorama
 from .proposal import Landmarks, ProposalSettings, related
 from .reference import Reference
 
@@ -59,6 +60,7 @@ class Lot:
         serials: (N,) a number that no other reference of the map ever had.
         poses: (N, 3) ``T_set_laser``.
         anchors: Their anchor points.
+        panoramas: (N, 180) what they saw.
         references: The references themselves; None for those that are read when needed.
         is_there: (N,) False for those that were removed.
         settings: Of the landmarks.
@@ -68,6 +70,7 @@ class Lot:
     serials: NDArray[np.int64]
     poses: NDArray[np.float64]
     anchors: AnchorStack
+    panoramas: NDArray[np.uint8]
     references: Sequence[Reference | None]
     is_there: NDArray[np.bool_]
     settings: ProposalSettings
@@ -99,6 +102,7 @@ class Lot:
         if (
             np.any(np.diff(self.identifiers) <= 0)
             or self.poses.shape != (count, 3)
+            or self.panoramas.shape != (count, DIRECTIONS)
             or not np.isfinite(self.poses).all()
             or anchors.main_angles.shape != (count,)
             or anchors.starts.shape != (count + 1,)
@@ -118,6 +122,15 @@ class Lot:
             return None
         return place if self.is_there[place] else None
 
+    def find_all(self, identifiers: NDArray[np.int64]) -> NDArray[np.int64]:
+        """(K,) places of references, -1 for those that are not there."""
+        if not len(self.identifiers):
+            return np.full(len(identifiers), -1)
+        places = np.searchsorted(self.identifiers, identifiers)
+        places = np.minimum(places, len(self.identifiers) - 1)
+        known = (self.identifiers[places] == identifiers) & self.is_there[places]
+        return np.where(known, places, -1)
+
     def without(self, place: int) -> Lot:
         """Remove a reference: this lot, in which it is marked, or one made anew."""
         self.is_there[place] = False
@@ -135,6 +148,7 @@ class Lot:
             np.concatenate([ours.serials, theirs.serials]),
             np.concatenate([ours.poses, theirs.poses]),
             ours.anchors.followed_by(theirs.anchors),
+            np.concatenate([ours.panoramas, theirs.panoramas]),
             [*ours.references, *theirs.references],
             np.ones(len(identifiers), np.bool_),
             self.settings,
@@ -153,6 +167,7 @@ class Lot:
             self.serials[places],
             self.poses[places],
             self.anchors.of_some(places),
+            self.panoramas[places],
             [self.references[place] for place in places.tolist()],
             self.is_there[places],
             self.settings,
@@ -170,12 +185,15 @@ def lot_of(known: Iterable[Known], first: int, settings: ProposalSettings) -> Lo
     Raises:
         ValueError: One has no pose, or two have the same identifier.
     """
-    references, anchors, poses = [], [], []
+    references, anchors, poses, panoramas = [], [], [], []
     for each in known:
         if each.reference.pose is None:
             raise ValueError(f"reference {each.reference.identifier} has no pose")
         references.append(each.reference)
         anchors.append(each.description.anchors)
+        panoramas.append(
+            panorama(each.description.angles.points, each.description.anchors.main_angle)
+        )
         poses.append(each.reference.pose.to_array())
     identifiers = np.array([each.identifier for each in references], np.int64)
     if len(np.unique(identifiers)) < len(identifiers):
@@ -185,6 +203,7 @@ def lot_of(known: Iterable[Known], first: int, settings: ProposalSettings) -> Lo
         np.arange(first, first + len(identifiers)),
         np.array(poses, np.float64).reshape(-1, 3),
         stack_anchors(anchors),
+        np.array(panoramas, np.uint8).reshape(-1, DIRECTIONS),
         references,
         np.ones(len(identifiers), np.bool_),
         settings,
@@ -199,7 +218,10 @@ def tidied(lots: Sequence[Lot]) -> tuple[Lot, ...]:
     left = list(lots)
     while len(left) > 1:
         before, last = len(left[-2]), len(left[-1])
-        if last and before + last > _SMALLEST and last <= _MERGED_SHARE * before:
+        if not last:  # merged, it would have all before it made anew
+            left.pop()
+            continue
+        if before + last > _SMALLEST and last <= _MERGED_SHARE * before:
             break
         other = left.pop()
         merged = left[-1].followed_by(other)

@@ -25,6 +25,7 @@ STAGES: Mapping[str, str] = {
     "anchors": "extraction",
     "graph": "extraction",
     "database": "search",
+    "panorama": "search",
     "proposal": "search",
     "alignment": "alignment",
     "evaluation": "evaluation",

@@ -9,9 +9,11 @@ from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import reduce
+from queue import SimpleQueue
 from typing import Any, TypeVar
 
 import numpy as np
@@ -26,6 +28,7 @@ from .field import FieldArrays, LikelihoodField, Tiles
 from .graph import anchor_graph
 from .hypothesis import Hypothesis
 from .pairwise import Known
+from .panorama import reordered, view, worth
 from .placed import Lot, lot_of, nearest, tidied
 from .pose import Pose2D
 from .proposal import (
@@ -49,6 +52,7 @@ _REMEMBERED = 4096
 _MOST_STANDING = 2048
 
 Value = TypeVar("Value")
+Other = TypeVar("Other")
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +60,8 @@ class MapSearch:
     """What a search in the stitched map came through.
 
     Args:
-        votes: Of the candidate references, best first; None where all may propose.
+        votes: Of the candidate references, in the order of what they are worth (``panorama``);
+            None where all may propose.
         proposals: Alignments that passed the first check.
         fits: What is left after all sieves, of the highest worth first.
         decision: What they are worth.
@@ -78,12 +83,12 @@ class _Content:
 
     Args:
         lots: The references.
-        tiles: The field stitched from them.
+        field: Stitched from them, and from what was added since.
         count: References that are there.
     """
 
     lots: tuple[Lot, ...]
-    tiles: Tiles
+    field: LikelihoodField
     count: int
 
     def find(self, identifier: int) -> tuple[Lot, int] | None:
@@ -93,6 +98,11 @@ class _Content:
             if place is not None:
                 return lot, place
         return None
+
+    @property
+    def tiles(self) -> Tiles:
+        """The map as it is now."""
+        return self.field.tiles
 
     @property
     def landmarks(self) -> list[Landmarks]:
@@ -113,10 +123,15 @@ class StitchedMap:
 
     def __init__(self, settings: Settings, known: Iterable[Known] = ()) -> None:
         self._begin(settings, _no_reading)
-        lot = lot_of(map(self._remembered, known), 0, settings.proposal)
+        # The map is stitched while the references are still being described.
+        described = _Passed[tuple[LaserScan, Pose2D]]()
+        with ThreadPoolExecutor(1) as thread:
+            field = thread.submit(LikelihoodField, settings.field, described)
+            with described:
+                passed = (described.put(_placed(each.reference), each) for each in known)
+                lot = lot_of(map(self._remembered, passed), 0, settings.proposal)
+            self._field = field.result()
         self._next_serial = len(lot)
-        references = [reference for reference in lot.references if reference is not None]
-        self._field = LikelihoodField(settings.field, map(_placed, references))
         self._hold((lot,))
 
     @classmethod
@@ -189,6 +204,7 @@ class StitchedMap:
             found = {
                 "references.identifiers": lot.identifiers,
                 "references.poses": lot.poses,
+                "references.panoramas": lot.panoramas,
                 **{f"anchors.{name}": array for name, array in vars(lot.anchors).items()},
                 **self._stored_landmarks(lot),
                 **{f"field.{name}": each for name, each in self._field.arrays()._asdict().items()},
@@ -242,13 +258,14 @@ class StitchedMap:
 
         Args:
             description: Of the scan.
-            most: How many references, those of the highest quality, may propose; None for all.
+            most: How many references, the best by votes and what they saw, may propose; None
+                for all.
         """
         settings, content = self._settings, self._content
         tiles = content.tiles
         seen = readings(description.angles, settings.verification)
         large = seen[seen[:, 2] == 0.0]
-        votes = None if most is None else self._voting().votes(description.graph, most)
+        votes = None if most is None else self._candidates(description, most, content)
         related = content.landmarks if votes is None else self._some(votes.references, content)
         proposed = proposals(description.anchors, large, related, tiles, settings.proposal)
         if not len(proposed.poses):
@@ -317,7 +334,7 @@ class StitchedMap:
         return hypotheses, known
 
     def _hold(self, lots: tuple[Lot, ...]) -> None:
-        self._content = _Content(lots, self._field.tiles, sum(map(len, lots)))
+        self._content = _Content(lots, self._field, sum(map(len, lots)))
 
     def _voting(self) -> RelationshipDatabase:
         with self._preparing:
@@ -332,6 +349,20 @@ class StitchedMap:
                     ),
                 )
             return self._database
+
+    def _candidates(self, description: Description, most: int, content: _Content) -> Votes:
+        """Choose by votes, and among the first of these by what they saw."""
+        compared = self._settings.database.compared
+        votes = self._voting().votes(description.graph, max(most, compared))
+        first = votes.references[:compared]
+        worths = np.full(len(first), -np.inf)  # of those removed in between
+        seen = view(description.angles.points, description.anchors)
+        for lot in content.lots:
+            places = lot.find_all(first)
+            at = np.flatnonzero(places >= 0)
+            found = (places[at], votes.quality[at], most)
+            worths[at] = worth(seen, lot.anchors, lot.panoramas, *found)
+        return reordered(votes, worths, most)
 
     def _some(self, identifiers: NDArray[np.int64], content: _Content) -> Landmarks:
         """Join the relations of single references, less any removed in between."""
@@ -367,6 +398,31 @@ class StitchedMap:
         return known
 
 
+class _Passed(Iterator[Value]):
+    """Values that one thread passes on to another until it is done."""
+
+    def __init__(self) -> None:
+        self._values: SimpleQueue[Value | None] = SimpleQueue()
+
+    def put(self, value: Value, returned: Other) -> Other:
+        """Pass on a value, and return another one."""
+        self._values.put(value)
+        return returned
+
+    def __enter__(self) -> None:
+        """Nothing is done yet."""
+
+    def __exit__(self, *_: object) -> None:
+        self._values.put(None)
+
+    def __next__(self) -> Value:
+        value = self._values.get()
+        if value is None:
+            self._values.put(None)  # for whoever asks again
+            raise StopIteration
+        return value
+
+
 class _Memory(dict[int, Value]):
     """Values that can be made again: beyond a number of them the oldest goes."""
 
@@ -394,6 +450,7 @@ def _section(arrays: Mapping[str, NDArray[Any]], prefix: str) -> dict[str, NDArr
 def _lot_from(arrays: Mapping[str, NDArray[Any]], settings: Settings) -> Lot:
     """Make a lot of stored arrays, whose landmarks are there already."""
     anchors = AnchorStack(**_section(arrays, "anchors."))
+    panoramas = arrays["references.panoramas"]
     identifiers, poses = arrays["references.identifiers"], arrays["references.poses"]
     count = len(identifiers)
     lot = Lot(
@@ -401,6 +458,7 @@ def _lot_from(arrays: Mapping[str, NDArray[Any]], settings: Settings) -> Lot:
         np.arange(count),
         poses,
         anchors,
+        panoramas,
         [None] * count,
         np.ones(count, np.bool_),
         settings.proposal,
