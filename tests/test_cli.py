@@ -310,6 +310,12 @@ def test_settings_come_from_a_preset_or_a_file(
     assert ReferenceSet.open(tmp_path / "own.apr").settings == one
 
 
+def test_the_package_runs_as_a_module() -> None:
+    words = [sys.executable, "-m", "anchorscan", "--version"]
+    said = subprocess.run(words, capture_output=True, text=True, check=True)
+    assert said.stdout == f"anchorscan {__version__}\n"
+
+
 def test_version_and_help(run: Run) -> None:
     assert run("--version").out == f"anchorscan {__version__}\n"
     text = run("--help").out
