@@ -191,7 +191,8 @@ class LikelihoodField:
         for rays in self._batches(scans):
             touched, _ = self._deposit(rays, 1)
             stale.update(map(tuple, touched.tolist()))
-        self._derive_all(np.array(sorted(stale), np.int64).reshape(-1, 2))
+        squares = np.array(sorted(stale), np.int64).reshape(-1, 2)
+        self._derive_all(squares, np.full((len(squares), 2), _ALL_BLOCKS, np.uint64))
         self._publish()
 
     @classmethod
@@ -314,8 +315,7 @@ class LikelihoodField:
             return
         squares = np.array(sorted(self._waiting), np.int64)
         dirty = np.array([self._waiting[square] for square in map(tuple, squares.tolist())])
-        for first in range(0, len(squares), _GROUP):
-            self._derive(squares[first : first + _GROUP], dirty[first : first + _GROUP])
+        self._derive_all(squares, dirty)
         self._publish()
         self._waiting = {}
 
@@ -408,11 +408,10 @@ class LikelihoodField:
         self._pages, self._corner = pages, (int(low[0]), int(low[1]))
         self._is_placed = True
 
-    def _derive_all(self, squares: NDArray[np.int64]) -> None:
-        """Derive all bytes of tiles, some at a time."""
+    def _derive_all(self, squares: NDArray[np.int64], dirty: NDArray[np.uint64]) -> None:
+        """Derive the dirty blocks of many tiles, some at a time."""
         for first in range(0, len(squares), _GROUP):
-            group = squares[first : first + _GROUP]
-            self._derive(group, np.full((len(group), 2), _ALL_BLOCKS, np.uint64))
+            self._derive(squares[first : first + _GROUP], dirty[first : first + _GROUP])
 
     def _derive(self, squares: NDArray[np.int64], dirty: NDArray[np.uint64]) -> None:
         """Bring the bytes of dirty blocks up to date, in new versions of their tiles."""
