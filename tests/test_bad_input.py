@@ -154,6 +154,15 @@ class TestTraps:
         assert scan.is_return.all()
         assert not LaserScan([1.0, 2.0], 0.0, 0.1, 1e299, 1e300).is_return.any()
 
+    def test_a_scan_of_a_million_readings_is_answered_and_nowhere(
+        self, records: list[Record]
+    ) -> None:
+        places = ReferenceSet.build(records)
+        angles = np.arange(1_000_000) * 6.0e-6
+        for ranges in (np.ones(len(angles)), 3.0 + np.sin(40.0 * angles)):
+            found = places.locate(LaserScan(ranges, angle_min=-3.0, angle_increment=6.0e-6))
+            assert not any(each.accepted for each in found)
+
 
 class TestWhatFuzzingFound:
     def test_a_run_whose_compression_is_damaged_is_an_error(self, tmp_path: Path) -> None:
