@@ -90,6 +90,8 @@ TOKENS_VARIABLE = "ANCHORSCAN_TOKENS"
 
 _OPTIONS_VARIABLE = "ANCHORSCAN_SERVICE"
 _SHORTEST_TOKEN = 16
+# Seconds in which a worker has to answer: on a busy machine one that only starts was taken for dead.
+_SLOWEST_START = 60
 _LOOPBACK = {"127.0.0.1", "localhost", "::1"}
 _METRICS_FOLDER = "PROMETHEUS_MULTIPROC_DIR"
 _SQLITE = "application/vnd.sqlite3"
@@ -219,6 +221,7 @@ def serve(
             server_header=False,
             timeout_keep_alive=75,
             timeout_graceful_shutdown=math.ceil(options.seconds),
+            timeout_worker_healthcheck=_SLOWEST_START,
         )
 
 
