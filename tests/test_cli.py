@@ -587,6 +587,8 @@ def test_ctrl_c_ends_a_run_quietly(log: Path, places: Path, processes: str) -> N
         stderr=subprocess.PIPE,
         text=True,
         start_new_session=True,
+        # Whoever starts the tests in the background lets them, and all they start, ignore it.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     ) as process:
         assert process.stdout is not None
         process.stdout.readline()

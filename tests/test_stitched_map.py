@@ -117,7 +117,7 @@ def test_a_turned_sensor_gives_the_turned_pose(number, k, turn):
         return  # of several that explain little, another may come first
     around = PLACES[number].locate(turned(scan, turn))[0]
     expected = straight.pose @ Pose2D(0.0, 0.0, -turn)
-    assert around.pose.distance(expected) < 0.02
+    assert around.pose.distance(expected) < 0.05
     assert around.pose.turn(expected) < math.radians(0.3)
 
 
