@@ -577,7 +577,12 @@ def test_an_interrupted_run_leaves_no_half_file(
 
 @pytest.mark.skipif(sys.platform == "win32", reason="signals are those of POSIX")
 @pytest.mark.parametrize("processes", ["1", "2"])
-def test_ctrl_c_ends_a_run_quietly(log: Path, places: Path, processes: str) -> None:
+def test_ctrl_c_ends_a_run_quietly(
+    log: Path, places: Path, processes: str, request: pytest.FixtureRequest
+) -> None:
+    # Whoever starts the tests in the background lets them, and all they start, ignore it.
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    request.addfinalizer(lambda: signal.signal(signal.SIGINT, before))
     endless = log.parent / f"endless-{processes}.log"
     endless.write_text(log.read_text(encoding="ascii") * 200, encoding="ascii")
     words = ("locate", places, endless, "--processes", processes)
@@ -587,8 +592,6 @@ def test_ctrl_c_ends_a_run_quietly(log: Path, places: Path, processes: str) -> N
         stderr=subprocess.PIPE,
         text=True,
         start_new_session=True,
-        # Whoever starts the tests in the background lets them, and all they start, ignore it.
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     ) as process:
         assert process.stdout is not None
         process.stdout.readline()
