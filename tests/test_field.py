@@ -167,13 +167,17 @@ def room():
 
 
 def plain_scores(tiles, readings, at, weights):
-    total = 0.0
+    all_of_it, believed, shares = [], [], []
     ends = Pose2D(*at).apply(readings[:, :2]).tolist()
-    for (x, y), row in zip(ends, readings[:, 2].astype(int), strict=True):
-        total += weights[
-            row, code_at(tiles, math.floor(x / tiles.resolution), math.floor(y / tiles.resolution))
-        ]
-    return total / len(readings)
+    for (x, y), small in zip(ends, readings[:, 2].astype(bool), strict=True):
+        code = code_at(tiles, math.floor(x / tiles.resolution), math.floor(y / tiles.resolution))
+        is_new = small and weights.is_new[code]
+        all_of_it.append(weights.scores[code])
+        believed.append(0.0 if is_new else weights.scores[code])
+        shares.append(weights.share if is_new else 1.0)
+    left_unexplained = 1.0 - sum(believed) / sum(shares)
+    price = weights.price if any(share != 1.0 for share in shares) else 1.0
+    return max(np.mean(all_of_it), 1.0 - price * left_unexplained)
 
 
 @given(seeds)
@@ -188,17 +192,34 @@ def test_scores_are_the_twins(room, seed):
     assert field_scores(at, np.empty((0, 3)), tiles, weights).tolist() == [0.0] * 3
 
 
+def test_new_things_are_believed_where_they_explain_enough(room):
+    tiles, weights = room[1].tiles, DEFAULT.weights()
+    seen = room[0][0][0].points
+    at = room[0][0][1].to_array()[np.newaxis]
+
+    def score(blocked, small):
+        readings = np.column_stack((seen, np.zeros(len(seen))))
+        readings[:blocked, :2] *= 0.5  # in known free space
+        readings[:blocked, 2] = small
+        return float(field_scores(at, readings, tiles, weights)[0])
+
+    few, half = len(seen) // 10, len(seen) // 2
+    assert score(0, 0.0) > score(few, 1.0) > score(half, 1.0) > 0.4
+    assert score(few, 1.0) > score(few, 0.0) + 0.05
+    assert score(half, 0.0) < 0.3
+
+
 @pytest.mark.interpreted
 def test_a_coarse_cell_has_the_best_score_of_its_cells():
     walls = box(-1.0, -0.7, 1.0, 0.7)
     scan = drawn(walls, sensor=SPARSE)
     limits = FieldSettings(resolution=0.2, reach=0.5)
     tiles = LikelihoodField(limits, [(scan, Pose2D(0.3, 0.2))]).tiles
-    weights = limits.weights()[0]
+    scores = limits.weights().scores
     for row in range(16 * tiles.height):
         for column in range(16 * tiles.width):
             best = max(
-                weights[cell_code(tiles, 4 * column + a, 4 * row + b)]
+                scores[cell_code(tiles, 4 * column + a, 4 * row + b)]
                 for a in range(4)
                 for b in range(4)
             )
@@ -217,21 +238,23 @@ def test_beyond_the_table_nothing_is_known(room):
 
 def test_weights_fall_with_the_distance_and_more_so_in_free_space():
     for limits in (DEFAULT, COARSE, FieldSettings(), FieldSettings(sharpness=0.2)):
-        weights, small = limits.weights()
-        assert weights.shape == small.shape == (256,)
-        unknown, free = weights[: FAR + 1], weights[FREE : FREE + FAR + 1]
+        weights = limits.weights()
+        scores = weights.scores
+        assert scores.shape == weights.is_new.shape == (256,)
+        unknown, free = scores[: FAR + 1], scores[FREE : FREE + FAR + 1]
         assert unknown[0] == free[0] == 1.0
         assert np.all(np.diff(unknown) <= 0.0)
         assert np.all(np.diff(free) <= 0.0)
         assert np.all(free <= unknown)
         assert unknown[FAR] == pytest.approx(limits.unknown_score)
         assert free[FAR] == pytest.approx(-limits.free_penalty)
-        # A small thing may be new where nothing was, and only there.
-        assert np.all(small >= weights)
-        assert small[FREE + FAR] == pytest.approx(limits.blocked_score)
-        np.testing.assert_array_equal(small[: FAR + 1], unknown)
+        # A thing may be new where nothing was, and only there.
+        assert weights.is_new[FREE + FAR]
+        assert np.all(weights.is_new.nonzero()[0] & FREE)
+        assert not np.any(weights.is_new & (scores > 0.5))
         # Whether the cell itself is a surface makes no difference to who ends near one.
-        np.testing.assert_array_equal(weights[SURFACE:], weights[:SURFACE])
+        np.testing.assert_array_equal(scores[SURFACE:], scores[:SURFACE])
+        np.testing.assert_array_equal(weights.is_new[SURFACE:], weights.is_new[:SURFACE])
 
 
 # Gauss-Newton on it.

@@ -58,14 +58,15 @@ def plain_codes(pose, points, tiles):
     return [int(cell_code(tiles, cx - tiles.column, cy - tiles.row)) for cx, cy in cells.tolist()]
 
 
-def plain_scores(pose, readings, tiles):
-    """A small thing loses nothing in free space but what it does not gain."""
-    codes = plain_codes(pose, readings[:, :2], tiles)
-    return [float(WEIGHTS[int(r), c]) for r, c in zip(readings[:, 2], codes, strict=True)]
-
-
 def plain_score(pose, readings, tiles):
-    return float(np.mean(plain_scores(pose, readings, tiles)))
+    """The better of the world as it was, and of one in which small things are new, for a price."""
+    codes = plain_codes(pose, readings[:, :2], tiles)
+    scores = WEIGHTS.scores[codes]
+    is_new = (readings[:, 2] > 0.0) & WEIGHTS.is_new[codes]
+    if not is_new.any():
+        return float(scores.mean())
+    believed = scores[~is_new].sum() / np.where(is_new, WEIGHTS.share, 1.0).sum()
+    return max(float(scores.mean()), 1.0 - WEIGHTS.price * (1.0 - believed))
 
 
 def plain_features(pose, readings, tiles):
@@ -75,7 +76,7 @@ def plain_features(pose, readings, tiles):
     is_free = (codes & 64) > 0
     is_far = (codes & 63) == 63
     shares = {
-        "score": plain_scores(pose, readings, tiles),
+        "score": [plain_score(pose, readings, tiles)],
         "near": distance <= 0.1,
         "close": distance <= 0.2,
         "free": is_far & is_free,

@@ -59,7 +59,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from ._jit import kernel
 from .angle_function import wrapped
-from .field import FieldSettings
+from .field import FieldSettings, Weights
 from .motion import Motion, MotionSettings
 from .verification import FEATURES, LARGEST_SCORE, Fits
 
@@ -172,8 +172,8 @@ class BeliefSettings(BaseModel):
     check_spacing: float = Field(2.0, ge=0.0, description="the same while located, metres")
     threshold: float = Field(0.99, gt=0.0, lt=1.0, description="probability that is reported")
 
-    def readings(self, field: FieldSettings) -> NDArray[np.float32]:
-        """(256,) score of a reading by the byte of the cell in which it ends.
+    def readings(self, field: FieldSettings) -> Weights:
+        """What a reading is worth, by the byte of the cell in which it ends; none is small.
 
         Milder than the scores that the search orders by: over time it counts more that the
         right place never looks wrong than that the best scan stands out.
@@ -181,7 +181,7 @@ class BeliefSettings(BaseModel):
         distance = (np.arange(256) & 63) * field.reach / 63.0
         score = np.maximum(0.0, 1.0 - distance / self.sharpness)
         score[127] = score[255] = -self.free_penalty
-        return np.asarray(score, np.float32)
+        return Weights(score.astype(np.float32), np.zeros(256, np.bool_), 1.0, 1.0)
 
 
 @dataclass(frozen=True, eq=False)

@@ -60,14 +60,14 @@ class DecisionSettings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
-    constant: float = Field(-5.19, description="of the logistic function")
-    log_margin: float = Field(1.51, description="weight of the logarithm of the margin")
-    explained: float = Field(1.63, description="weight of -log(1 - score)")
+    constant: float = Field(-5.10, description="of the logistic function")
+    log_margin: float = Field(1.35, description="weight of the logarithm of the margin")
+    explained: float = Field(1.41, description="weight of -log(1 - score)")
     through: float = Field(
-        -2.86, description="weight of the root of the share of rays that see through"
+        -3.27, description="weight of the root of the share of rays that see through"
     )
-    heading: float = Field(0.64, description="weight of the logarithm of what holds the heading")
-    anchors: float = Field(1.04, description="weight of the logarithm of the anchor points")
+    heading: float = Field(0.71, description="weight of the logarithm of what holds the heading")
+    anchors: float = Field(1.03, description="weight of the logarithm of the anchor points")
     rivalry: float = Field(4.5, gt=0.0, description="of the fits for what the best leaves")
     elsewhere: float = Field(0.8, description="score with which 'somewhere else' competes")
     threshold: float = Field(0.96, gt=0.0, le=1.0, description="probability that is an answer")

@@ -22,7 +22,7 @@ from .database import RelationshipDatabase, Votes
 from .description import Description, describe
 from .errors import AnchorscanError
 from .evaluation import Evaluation
-from .field import LikelihoodField, Tiles, field_scores
+from .field import LikelihoodField, Tiles, Weights, field_scores
 from .graph import AnchorGraph, stack
 from .hypothesis import Hypothesis
 from .matcher import Trace
@@ -294,10 +294,8 @@ def _codes(tiles: Tiles, points: NDArray[np.float64]) -> NDArray[np.uint8]:
     """Byte of the cell at each point: what a map scores that scores a cell by its byte."""
     poses = np.zeros((len(points), 3))
     poses[:, :2] = points
-    itself = np.arange(256, dtype=np.float32)
-    return np.asarray(field_scores(poses, np.zeros((1, 3)), tiles, itself[np.newaxis])).astype(
-        np.uint8
-    )
+    weights = Weights(np.arange(256, dtype=np.float32), np.zeros(256, np.bool_), 1.0, 1.0)
+    return np.asarray(field_scores(poses, np.zeros((1, 3)), tiles, weights)).astype(np.uint8)
 
 
 def wall_points(references: Iterable[Reference], cell: float = 0.05) -> NDArray[np.float64]:

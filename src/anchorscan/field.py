@@ -74,6 +74,22 @@ _1, _4, _6, _8, _12 = (np.uint64(value) for value in (1, 4, 6, 8, 12))
 _15, _63, _64 = (np.uint64(value) for value in (15, 63, 64))
 
 
+class Weights(NamedTuple):
+    """What readings are worth by the byte of the cell in which they end.
+
+    Args:
+        scores: (256,) float32, one at most.
+        is_new: (256,) whether a small thing there would be new.
+        share: A reading on a new thing counts as this share of one.
+        price: What new things leave unexplained counts as so many times as much.
+    """
+
+    scores: NDArray[np.float32]
+    is_new: NDArray[np.bool_]
+    share: float
+    price: float
+
+
 class FieldSettings(BaseModel):
     """Settings of the stitched map."""
 
@@ -94,26 +110,26 @@ class FieldSettings(BaseModel):
         0.05, ge=0.0, le=1.0, description="score of a reading that ends where nobody looked"
     )
     free_penalty: float = Field(0.7, ge=0.0, description="score lost in known free space")
-    blocked_score: float = Field(
-        0.6, ge=0.0, le=1.0, description="score there of a small thing, which may be a person"
+    new_share: float = Field(
+        0.1,
+        gt=0.0,
+        le=1.0,
+        description="a reading on a new thing, maybe a person, counts as this share of one",
+    )
+    new_price: float = Field(
+        1.6, ge=1.0, description="new things have to leave so many times less unexplained"
     )
 
-    def weights(self) -> NDArray[np.float32]:
-        """(2, 256) score of a reading by the byte of the cell in which it ends.
-
-        The second row is for readings on small things.  What is small may be new: where the
-        map knows free space it is hardly taken against a pose, since it may stand before the
-        surface that was there, and elsewhere it counts as any other reading.
-        """
+    def weights(self) -> Weights:
+        """What a reading is worth, and which may be of new things: see ``field_scores``."""
         code = np.arange(256)
         distance = (code & _FAR) * self.reach / _FAR
         score = np.maximum(self.unknown_score, 1.0 - distance / self.sharpness)
         near, far = 0.5 * self.sharpness, 0.75 * self.sharpness
         fall = np.interp(distance, (near, far), (0.5, -self.free_penalty))
         is_free = ((code & _FREE) > 0) & (distance > near)
-        score = np.where(is_free, fall, score)
-        small = np.where(is_free, np.maximum(score, self.blocked_score), score)
-        return np.stack((score, small)).astype(np.float32)
+        scores = np.where(is_free, fall, score).astype(np.float32)
+        return Weights(scores, is_free, self.new_share, self.new_price)
 
 
 class Tiles(NamedTuple):
@@ -185,7 +201,7 @@ class LikelihoodField:
         unknown = np.full((1, _SIDE * _SIDE), _FAR, np.uint8)
         coarse = np.zeros((1, (_SIDE // _COARSE) ** 2), np.int8)
         everything = np.full((1, 2), _ALL_BLOCKS, np.uint64)
-        _pool(np.zeros(1, np.int32), everything, unknown, coarse, settings.weights()[0])
+        _pool(np.zeros(1, np.int32), everything, unknown, coarse, settings.weights().scores)
         self._begin(settings, TileEvidence(), unknown, coarse, 1)
         stale: set[tuple[int, int]] = set()
         for rays in self._batches(scans):
@@ -231,7 +247,7 @@ class LikelihoodField:
         used: int,
     ) -> None:
         self._settings = settings
-        self._weights = settings.weights()[0]
+        self._scores = settings.weights().scores
         self._evidence = evidence
         self._pages = np.zeros((1, 1), np.int32)
         self._corner = (0, 0)  # of the pages, counted in pages
@@ -427,7 +443,7 @@ class LikelihoodField:
         )
         tiles = self._renewed(squares)
         _derive(tiles, rows, dirty, self._evidence.layers, self._codes, limits)
-        _pool(tiles, dirty, self._codes, self._coarse, self._weights)
+        _pool(tiles, dirty, self._codes, self._coarse, self._scores)
 
     def _around(self, squares: NDArray[np.int64]) -> NDArray[np.int64]:
         """Squares with those within reach of them, one behind the other."""
@@ -637,7 +653,7 @@ def _derive(tiles, around, dirty, layers, codes, limits):  # type: ignore[no-unt
 
 
 @kernel
-def _pool(tiles, dirty, codes, coarse, weights):  # type: ignore[no-untyped-def]
+def _pool(tiles, dirty, codes, coarse, scores):  # type: ignore[no-untyped-def]
     """Best score in every coarse cell of the dirty blocks."""
     side = _SIDE // _COARSE
     for n in range(len(tiles)):
@@ -650,7 +666,7 @@ def _pool(tiles, dirty, codes, coarse, weights):  # type: ignore[no-untyped-def]
                 for b in range(_COARSE):
                     for a in range(_COARSE):
                         at = (j * _COARSE + b) * _SIDE + i * _COARSE + a
-                        best = max(best, weights[codes[tiles[n], at]])
+                        best = max(best, scores[codes[tiles[n], at]])
                 coarse[tiles[n], j * side + i] = int(round(127.0 * best))
 
 
@@ -682,9 +698,9 @@ def coarse_score(tiles, cx, cy):  # type: ignore[no-untyped-def]
 
 @kernel
 def field_scores(poses, readings, tiles, weights):  # type: ignore[no-untyped-def]
-    """(P,) mean score of readings (scan frame) at each of (P, 3) poses.
+    """(P,) score of readings (scan frame) at each of (P, 3) poses.
 
-    Readings are (N, 3): x, y and the row of the weights that is theirs.
+    Readings are (N, 3): x, y and 1 for those on small things.
     """
     scores = np.empty(len(poses))
     scale = 1.0 / tiles.resolution
@@ -693,13 +709,36 @@ def field_scores(poses, readings, tiles, weights):  # type: ignore[no-untyped-de
         s = math.sin(poses[p, 2]) * scale
         x = poses[p, 0] * scale - tiles.column
         y = poses[p, 1] * scale - tiles.row
-        total = 0.0
+        total, held_against, new = 0.0, 0.0, 0
         for i in range(len(readings)):
             cx = int(x + c * readings[i, 0] - s * readings[i, 1])
             cy = int(y + s * readings[i, 0] + c * readings[i, 1])
-            total += weights[int(readings[i, 2]), cell_code(tiles, cx, cy)]
-        scores[p] = total / max(len(readings), 1)
+            code = cell_code(tiles, cx, cy)
+            total += weights.scores[code]
+            if readings[i, 2] > 0.0 and weights.is_new[code]:
+                held_against += weights.scores[code]
+                new += 1
+        scores[p] = better_score(total, len(readings), held_against, new, weights)
     return scores
+
+
+@kernel
+def better_score(total, count, held_against, new, weights):  # type: ignore[no-untyped-def]
+    """Mean score of readings, in the world as it was or in one with new things.
+
+    A small thing in known free space, as a person is, may be new, and then its readings are not
+    held against the pose: they score nothing and count less.  But that explains more at any
+    pose, so that what it leaves unexplained has a price.
+
+    ``total`` is the sum of the scores of all ``count`` readings, ``held_against`` of the ``new``.
+    """
+    if count == 0:
+        return 0.0
+    as_it_was = total / count
+    if new == 0:
+        return as_it_was
+    with_new = (total - held_against) / (count - (1.0 - weights.share) * new)
+    return max(as_it_was, 1.0 - weights.price * (1.0 - with_new))
 
 
 @kernel

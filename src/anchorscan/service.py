@@ -90,7 +90,7 @@ TOKENS_VARIABLE = "ANCHORSCAN_TOKENS"
 
 _OPTIONS_VARIABLE = "ANCHORSCAN_SERVICE"
 _SHORTEST_TOKEN = 16
-# Seconds in which a worker has to answer: on a busy machine one that only starts was taken for dead.
+# Seconds in which a worker answers: on a busy machine one that only starts was taken for dead.
 _SLOWEST_START = 60
 _LOOPBACK = {"127.0.0.1", "localhost", "::1"}
 _METRICS_FOLDER = "PROMETHEUS_MULTIPROC_DIR"

@@ -90,12 +90,12 @@ PRESETS: Mapping[str, Mapping[str, Any]] = types.MappingProxyType(
                 "rays": 180,
             },
             "decision": {
-                "constant": -5.42,
-                "log_margin": 1.26,
-                "explained": 1.35,
-                "through": -4.75,
-                "heading": 0.70,
-                "anchors": 0.87,
+                "constant": -5.10,
+                "log_margin": 1.20,
+                "explained": 1.04,
+                "through": -3.65,
+                "heading": 0.80,
+                "anchors": 0.71,
             },
         },
     }

@@ -29,7 +29,9 @@ from ._jit import kernel
 from .angle_function import AngleFunction, wrapped
 from .field import (
     Tiles,
+    Weights,
     _solved,
+    better_score,
     cell_code,
     field_scores,
     normal_equations,
@@ -137,7 +139,7 @@ def verify(
     poses: NDArray[np.float64],
     readings: NDArray[np.float64],
     tiles: Tiles,
-    weights: NDArray[np.float32],
+    weights: Weights,
     settings: VerificationSettings,
 ) -> Fits:
     """Sieve (P, 3) proposed poses and refine what is left.
@@ -146,7 +148,7 @@ def verify(
         poses: T_set_laser, metres and radians.
         readings: (N, 3) of the scan, see ``readings``.
         tiles: The stitched map.
-        weights: (2, 256) score of a reading by the byte of its cell, on large and small things.
+        weights: What a reading is worth by the byte of its cell.
         settings: Of the sieves.
     """
     sieves = (
@@ -172,7 +174,7 @@ def follow(
     stiffness: NDArray[np.float64],
     points: NDArray[np.float64],
     tiles: Tiles,
-    weights: NDArray[np.float32],
+    weights: Weights,
     settings: VerificationSettings,
 ) -> Fits:
     """Refine (K, 3) expected poses, each held back by how sure the expectation is.
@@ -186,7 +188,7 @@ def follow(
         stiffness: (K, 3, 3) inverse covariance of each, times the variance of a reading.
         points: (N, 2) end points of the scan's returns, metres, scan frame.
         tiles: The stitched map.
-        weights: (256,) score of a reading by the byte of its cell.
+        weights: What a reading is worth by the byte of its cell; no reading counts as small.
         settings: How many readings and steps.
 
     Returns:
@@ -195,7 +197,7 @@ def follow(
     steps = (settings.fit_readings, settings.iterations, settings.last_readings)
     rays = (settings.rays, settings.through_margin)
     alike = np.column_stack((points, np.zeros(len(points))))
-    found = _follow(poses, stiffness, alike, tiles, weights[np.newaxis], steps, rays)
+    found = _follow(poses, stiffness, alike, tiles, weights, steps, rays)
     moved, features, hessians, residuals = found
     count = min(len(points), settings.last_readings)
     return Fits(moved, features, hessians, residuals, count)
@@ -243,6 +245,7 @@ def _distinct(poses, distance, turn, most):  # type: ignore[no-untyped-def]
 def _features(pose, readings, tiles, weights, numbers):  # type: ignore[no-untyped-def]
     """The numbers of ``FEATURES`` for one pose, but for the rays."""
     numbers[:] = 0.0
+    total, held_against, new = 0.0, 0.0, 0
     c, s = math.cos(pose[2]) / tiles.resolution, math.sin(pose[2]) / tiles.resolution
     x = pose[0] / tiles.resolution - tiles.column
     y = pose[1] / tiles.resolution - tiles.row
@@ -254,7 +257,10 @@ def _features(pose, readings, tiles, weights, numbers):  # type: ignore[no-untyp
         )
         distance = (code & 63) * tiles.reach / 63.0
         free = (code & 64) > 0
-        numbers[0] += weights[int(readings[i, 2]), code]
+        total += weights.scores[code]
+        if readings[i, 2] > 0.0 and weights.is_new[code]:
+            held_against += weights.scores[code]
+            new += 1
         numbers[1] += distance <= 0.1
         numbers[2] += distance <= 0.2
         if distance >= tiles.reach:
@@ -262,6 +268,7 @@ def _features(pose, readings, tiles, weights, numbers):  # type: ignore[no-untyp
         elif distance > 0.2 and free:
             numbers[6] += 1
     numbers /= max(len(readings), 1)
+    numbers[0] = better_score(total, len(readings), held_against, new, weights)
 
 
 @kernel
