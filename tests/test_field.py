@@ -31,6 +31,7 @@ from anchorscan.field import (
     field_scores,
     normal_equations,
     passed_through,
+    put_hessian,
     refined,
 )
 from anchorscan.field import _solved as solved
@@ -297,7 +298,10 @@ def test_normal_equations_are_those_of_the_slopes(room, seed):
     (scan, pose), *_ = room[0]
     points = scan.points[rng.integers(len(scan.points), size=12)]
     at = pose.to_array() + rng.normal(0.0, (0.1, 0.1, 0.03))
-    ours = normal_equations(at, points, room[1].tiles, 0.1)
+    triangle, gradient, *sums = normal_equations(at, points, room[1].tiles, 0.1)
+    hessian = np.empty((3, 3))
+    put_hessian(triangle, hessian)
+    ours = (hessian, gradient, *sums)
     theirs = plain_normal_equations(at, points, room[1].tiles, 0.1)
     for a, b in zip(ours, theirs, strict=True):
         np.testing.assert_allclose(a, b, atol=1e-5, rtol=1e-5)
@@ -309,7 +313,10 @@ def test_the_damped_system_is_solved(seed):
     slopes = rng.normal(0.0, 3.0, (int(rng.integers(0, 5)), 3))
     hessian, gradient = slopes.T @ slopes, rng.normal(0.0, 1.0, 3)
     expected = np.linalg.solve(hessian + 0.7 * np.eye(3), gradient)
-    np.testing.assert_allclose(solved(hessian, gradient, 0.7), expected, rtol=1e-9, atol=1e-9)
+    triangle = tuple(hessian[np.triu_indices(3)])
+    np.testing.assert_allclose(
+        solved(triangle, tuple(gradient), 0.7), expected, rtol=1e-9, atol=1e-9
+    )
 
 
 def test_the_truth_is_a_fixed_point_of_the_refinement(room):

@@ -18,17 +18,31 @@ from typing import Any
 import numba
 from numba.core.dispatcher import Dispatcher
 
-__all__ = ["kernel"]
+__all__ = ["inlined", "kernel"]
 
 
 def kernel(function: Callable[..., Any]) -> Any:
     """Compile ``function`` without Python objects, cached on disk where that is possible."""
+    return _compiled(function, forceinline=False)
+
+
+def inlined(function: Callable[..., Any]) -> Any:
+    """Compile ``function`` into every kernel that calls it.
+
+    For what is called in inner loops and is too large for the compiler to do that by itself:
+    a call hands over every field of every array, which may cost more than the function does.
+    """
+    return _compiled(function, forceinline=True)
+
+
+def _compiled(function: Callable[..., Any], forceinline: bool) -> Any:
+    options: dict[str, Any] = {"nogil": True, "error_model": "numpy", "forceinline": forceinline}
     try:
-        compiled: Any = numba.njit(cache=True, nogil=True, error_model="numpy")(function)
+        compiled: Any = numba.njit(cache=True, **options)(function)
         file = compiled._cache._cache_file
         file._source_stamp = (file._source_stamp, _borrowed(function.__globals__))
     except (RuntimeError, AttributeError):  # AttributeError: a numba that caches in another way
-        return numba.njit(nogil=True, error_model="numpy")(function)
+        return numba.njit(**options)(function)
     return compiled
 
 

@@ -232,12 +232,9 @@ def gather(
     rows = np.concatenate(
         [jumps, turns, *(_crossings(e.main_angle, e.x_walls, e.y_walls) for e in edges)]
     )
-    return AnchorPoints(
-        np.ascontiguousarray(rows[:, :2]),
-        rows[:, 3].astype(np.int64),
-        np.ascontiguousarray(rows[:, 2]),
-        edges[0].main_angle if edges else math.nan,
-    )
+    positions, kinds, directions = _columns(rows)
+    main_angle = edges[0].main_angle if edges else math.nan
+    return AnchorPoints(positions, kinds, directions, main_angle)
 
 
 def jump_edge_anchors(
@@ -294,25 +291,17 @@ def virtual_edges(angles: AngleFunction, settings: AnchorSettings) -> list[Virtu
         settings.most_main_angles,
         settings.smallest_main_share,
     ):
-        histograms, origin = _wall_histograms(
+        histograms, origin, x_walls, y_walls = _virtual_edges(
             angles.points,
             angles.surface,
             angles.extents,
             main,
-            settings.histogram_bin,
             settings.wall_angle,
             settings.facing,
+            (settings.histogram_bin, settings.smallest_wall, settings.most_walls),
         )
-        limits = (origin, settings.histogram_bin, settings.smallest_wall, settings.most_walls)
         found.append(
-            VirtualEdges(
-                float(main),
-                histograms,
-                origin,
-                settings.histogram_bin,
-                _walls(histograms[0], limits, settings.facing),
-                _walls(histograms[1], limits, settings.facing),
-            )
+            VirtualEdges(float(main), histograms, origin, settings.histogram_bin, x_walls, y_walls)
         )
     return found
 
@@ -480,6 +469,16 @@ def _main_angles(surface, weights, bins, most, share):  # type: ignore[no-untype
 
 
 @kernel
+def _virtual_edges(points, surface, weights, main, wall_angle, facing, limits):  # type: ignore[no-untyped-def]
+    """Histograms of one main angle, where they begin, and the walls over x and over y."""
+    width, smallest, most = limits
+    histograms, origin = _wall_histograms(points, surface, weights, main, width, wall_angle, facing)
+    peaks = (origin, width, smallest, most)
+    x_walls = _walls(histograms[0], peaks, facing)
+    return histograms, origin, x_walls, _walls(histograms[1], peaks, facing)
+
+
+@kernel
 def _makes_wall(point, surface):  # type: ignore[no-untyped-def]
     """Whether a return shows a surface, and one that is not farther than any building's."""
     return not math.isnan(surface) and max(abs(point[0]), abs(point[1])) < _FARTHEST_WALL
@@ -560,3 +559,15 @@ def _crossings(main, x_walls, y_walls):  # type: ignore[no-untyped-def]
             rows[found, 3] = 4.0
             found += 1
     return rows
+
+
+@kernel
+def _columns(rows):  # type: ignore[no-untyped-def]
+    """Positions, kinds and directions of anchors in rows x, y, direction, kind."""
+    positions = np.empty((len(rows), 2))
+    kinds = np.empty(len(rows), np.int64)
+    directions = np.empty(len(rows))
+    for k in range(len(rows)):
+        positions[k, 0], positions[k, 1] = rows[k, 0], rows[k, 1]
+        directions[k], kinds[k] = rows[k, 2], int(rows[k, 3])
+    return positions, kinds, directions

@@ -99,32 +99,21 @@ def angle_function(scan: LaserScan, settings: AngleFunctionSettings) -> AngleFun
     turn are neighbours, and a second look at the same direction is dropped.
     """
     step = abs(scan.angle_increment)
-    points, ranges, beams, indices, count = _returns(
+    is_full_turn = scan.is_full_turn
+    points, ranges, beams, gaps, runs, way, surface, extents, moments = _angle_function(
         scan.ranges,
-        scan.angle_min,
-        scan.angle_increment,
-        scan.shortest_return,
-        scan.longest_return,
-    )
-    gaps = _gaps(
-        points,
-        ranges,
-        beams,
-        indices,
-        _free_before(scan.ranges, scan.range_max, scan.angle_increment, count),
-        max(count, round(2.0 * math.pi / step)) if scan.is_full_turn else 0,
-        step,
+        (scan.angle_min, scan.angle_increment, scan.shortest_return, scan.longest_return),
+        scan.range_max,
+        round(2.0 * math.pi / step) if is_full_turn else 0,
         (
             settings.grazing_angle,
             settings.noise,
             settings.largest_gap,
             settings.smallest_jump,
         ),
+        settings.baseline,
+        settings.fitted,
     )
-    if scan.is_full_turn and len(beams):
-        points, ranges, beams, gaps = _begin_at_gap(points, ranges, beams, gaps)
-    runs, way, extents, moments = _runs(points, ranges, gaps, step, settings.noise)
-    surface = _surface(points, runs, way, moments, settings.baseline, settings.fitted)
     return AngleFunction(
         points, ranges, beams, gaps, runs, way, surface, extents, moments, scan.range_max
     )
@@ -156,8 +145,28 @@ def main_angle(histogram: NDArray[np.float64]) -> float:
 
 
 @kernel
-def _returns(ranges, angle_min, increment, range_min, range_max):  # type: ignore[no-untyped-def]
+def _angle_function(readings, geometry, range_max, turn, limits, baseline, fitted):  # type: ignore[no-untyped-def]
+    """All arrays of an ``AngleFunction``, in their order.
+
+    ``geometry`` is the first direction, the increment, the shortest and the longest return;
+    ``turn`` the number of readings in a full turn where the sweep is closed, or else 0.
+    """
+    step = abs(geometry[1])
+    points, ranges, beams, indices, count = _returns(readings, geometry)
+    free = _free_before(readings, range_max, geometry[1], count)
+    closed = max(count, turn) if turn > 0 else 0
+    gaps = _gaps(ranges, indices, free, closed, step, limits)
+    if turn > 0 and len(beams) > 0:
+        points, ranges, beams, gaps = _begin_at_gap(points, ranges, beams, gaps)
+    runs, way, extents, moments = _runs(points, ranges, gaps, step, limits[1])
+    surface = _surface(points, runs, way, moments, baseline, fitted)
+    return points, ranges, beams, gaps, runs, way, surface, extents, moments
+
+
+@kernel
+def _returns(ranges, geometry):  # type: ignore[no-untyped-def]
     """End points, ranges, directions and sweep positions of the returns, counter-clockwise."""
+    angle_min, increment, range_min, range_max = geometry
     step = abs(increment)
     count = len(ranges)
     if count > 1:
@@ -204,7 +213,7 @@ def _gap(near, far, cosine, spread, limits):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _gaps(points, ranges, beams, indices, free, turn, step, limits):  # type: ignore[no-untyped-def]
+def _gaps(ranges, indices, free, turn, step, limits):  # type: ignore[no-untyped-def]
     """What lies between each return and the next.
 
     ``turn`` is the number of readings in a full turn where the sweep is closed, or else 0.

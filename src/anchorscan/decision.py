@@ -118,21 +118,29 @@ def evidence(fits: Fits, anchors: int) -> NDArray[np.float64]:
         fits: At least one.
         anchors: How many anchor points the scan has.
     """
-    score, through = (float(fits.features[0, k]) for k in (_SCORE, _THROUGH))
-    rival = (0.5 * score, 0.0)
-    if len(fits) > 1:
-        rival = float(fits.features[1, _SCORE]), float(fits.features[1, _THROUGH])
-    margin = max(worth(score, through) - worth(*rival), _SMALLEST_MARGIN)
+    numbers: NDArray[np.float64] = _evidence(
+        fits.features, fits.hessians[0, 2, 2], fits.readings, anchors
+    )
+    return numbers
+
+
+@kernel
+def _evidence(features, heading, readings, anchors):  # type: ignore[no-untyped-def]
+    score, through = features[0, _SCORE], features[0, _THROUGH]
+    rival = worth(0.5 * score, 0.0)
+    if len(features) > 1:
+        rival = worth(features[1, _SCORE], features[1, _THROUGH])
+    margin = max(worth(score, through) - rival, _SMALLEST_MARGIN)
     rest = 1.0 - min(score, LARGEST_SCORE)
-    rest += _LUCKY_READINGS * max(0.0, 1.0 / max(fits.readings, 1) - 1.0 / _MANY_READINGS)
+    rest += _LUCKY_READINGS * max(0.0, 1.0 / max(readings, 1) - 1.0 / _MANY_READINGS)
     return np.array(
         [
             1.0,
             math.log(margin),
             -math.log(rest),
             math.sqrt(through),
-            math.log1p(float(fits.hessians[0, 2, 2])),
-            math.log1p(anchors),
+            math.log1p(heading),
+            math.log1p(float(anchors)),
         ]
     )
 
@@ -200,8 +208,8 @@ def decide(fits: Fits, anchors: int, settings: DecisionSettings) -> Decision:
         return Decision(np.empty(0), 1.0, False)
     place = _logistic(float(np.dot(evidence(fits, anchors), settings.weights)))
     best = place * held(covariance(fits[:1], settings)[0])
-    probabilities, elsewhere = _shared(
-        best, _worths(fits.features), worth(settings.elsewhere, 0.0), settings.rivalry
+    probabilities, elsewhere = _all_shared(
+        best, fits.features, settings.elsewhere, settings.rivalry
     )
     return Decision(probabilities, elsewhere, best >= settings.threshold)
 
@@ -218,6 +226,11 @@ def _worths(features):  # type: ignore[no-untyped-def]
     for k in range(len(features)):
         out[k] = worth(features[k, _SCORE], features[k, _THROUGH])
     return out
+
+
+@kernel
+def _all_shared(best, features, elsewhere, rivalry):  # type: ignore[no-untyped-def]
+    return _shared(best, _worths(features), worth(elsewhere, 0.0), rivalry)
 
 
 @kernel

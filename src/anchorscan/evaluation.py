@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
-from ._jit import kernel
+from ._jit import inlined, kernel
 from .angle_function import (
     CONNECTED,
     FREE,
@@ -47,6 +47,7 @@ __all__ = [
     "clearance",
     "evaluate",
     "evaluate_all",
+    "evaluate_outlines",
     "outline",
     "probability",
     "stack_outlines",
@@ -208,6 +209,32 @@ def evaluate_all(
         (settings.tolerance, settings.relative_tolerance, settings.largest_tolerance),
     )
     return e_m
+
+
+def evaluate_outlines(
+    scan: Outline,
+    reference: Outline,
+    T_reference_scan: NDArray[np.float64],
+    settings: EvaluationSettings,
+) -> float:
+    """Compute e_m of one alignment (section 5).
+
+    Args:
+        scan: The scan.
+        reference: The reference.
+        T_reference_scan: (3,) x, y, theta, metres and radians.
+        settings: Of the evaluation.
+    """
+    return float(
+        _evaluation(
+            scan.rows,
+            scan.geometry,
+            reference.rows,
+            reference.geometry,
+            T_reference_scan,
+            (settings.tolerance, settings.relative_tolerance, settings.largest_tolerance),
+        )
+    )
 
 
 def evaluate(
@@ -384,16 +411,16 @@ def _render(rows, pose, geometry, inverse):  # type: ignore[no-untyped-def]
                 span -= period
             elif span < -0.5 * period:
                 span += period
-            if span >= 0.0:
-                _draw(k_before, span, over_before, over, step, period, inverse)
-            else:
-                _draw(k, -span, over, over_before, step, period, inverse)
+            begin, near, far = (k_before, over_before, over)
+            if span < 0.0:
+                begin, near, far = (k, over, over_before)
+            _draw(begin, abs(span), near, far, step, period, inverse)
         if not (joined_before and joined):
             # The margin of a surface reaches half a beam beyond its last reading.
             _draw(k - 0.5 + _SLACK, 1.0 - 3.0 * _SLACK, over, over, step, period, inverse)
 
 
-@kernel
+@inlined
 def _draw(k, span, over, over_end, step, period, inverse):  # type: ignore[no-untyped-def]
     """Draw a line from beam coordinate ``k`` over ``span`` beams; the nearest remains."""
     if k < 0.0:
@@ -404,9 +431,12 @@ def _draw(k, span, over, over_end, step, period, inverse):  # type: ignore[no-un
         return
     for lap in range(2):
         begin = k - lap * period
-        low = max(math.ceil(begin - _SLACK), 0.0)
-        high = min(math.floor(begin + span + _SLACK), len(inverse) - 1.0)
-        for beam in range(int(low), int(high) + 1):
+        end = begin + span + _SLACK
+        if end < 0.0:
+            return
+        low = max(int(math.ceil(begin - _SLACK)), 0)
+        high = min(int(end), len(inverse) - 1)
+        for beam in range(low, high + 1):
             along = min(max(beam - begin, 0.0), span)
             if wide:
                 value = math.sin((span - along) * step) * over + math.sin(along * step) * over_end
@@ -434,27 +464,25 @@ def _agreement(rows, geometry, inverse, tolerances):  # type: ignore[no-untyped-
 
 
 @kernel
+def _evaluation(rows, geometry, reference_rows, reference_geometry, pose, tolerances):  # type: ignore[no-untyped-def]
+    """e_m of one alignment."""
+    if _reference_has_overview(rows, geometry, reference_rows, reference_geometry, pose):
+        c, s = math.cos(pose[2]), math.sin(pose[2])
+        back = (-c * pose[0] - s * pose[1], s * pose[0] - c * pose[1], -pose[2])
+        inverse = np.zeros(int(geometry[2]))
+        _render(reference_rows, back, geometry, inverse)
+        return _agreement(rows, geometry, inverse, tolerances)
+    inverse = np.zeros(int(reference_geometry[2]))
+    _render(rows, (pose[0], pose[1], pose[2]), reference_geometry, inverse)
+    return _agreement(reference_rows, reference_geometry, inverse, tolerances)
+
+
+@kernel
 def _evaluations(rows, geometry, all_rows, starts, geometries, candidates, poses, tolerances):  # type: ignore[no-untyped-def]
     """(N,) e_m of all alignments."""
     e_m = np.empty(len(poses))
-    most = geometry[2]
-    for c in range(len(geometries)):
-        most = max(most, geometries[c, 2])
-    scratch = np.empty(int(most))
     for n in range(len(poses)):
         c = candidates[n]
         reference_rows = all_rows[starts[c] : starts[c + 1]]
-        pose = poses[n]
-        if _reference_has_overview(rows, geometry, reference_rows, geometries[c], pose):
-            inverse = scratch[: int(geometry[2])]
-            inverse[:] = 0.0
-            co, si = math.cos(pose[2]), math.sin(pose[2])
-            back = np.array((-co * pose[0] - si * pose[1], si * pose[0] - co * pose[1], -pose[2]))
-            _render(reference_rows, back, geometry, inverse)
-            e_m[n] = _agreement(rows, geometry, inverse, tolerances)
-        else:
-            inverse = scratch[: int(geometries[c, 2])]
-            inverse[:] = 0.0
-            _render(rows, pose, geometries[c], inverse)
-            e_m[n] = _agreement(reference_rows, geometries[c], inverse, tolerances)
+        e_m[n] = _evaluation(rows, geometry, reference_rows, geometries[c], poses[n], tolerances)
     return e_m

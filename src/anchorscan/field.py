@@ -38,7 +38,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
-from ._jit import kernel
+from ._jit import inlined, kernel
 from .errors import AnchorscanError
 from .evidence import SIDE as _SIDE
 from .evidence import TileEvidence
@@ -55,6 +55,8 @@ _FAR = 63  # distance code of "farther than reach"
 _FREE, _SURFACE = 64, 128
 # Farther than this from all surfaces, metres, a ray is clear of them.
 _CLEAR = 0.2
+# From centre to corner in both of two cells, and some rounding, in cells.
+_CORNERS = 1.415
 _PAGE = 64  # squares along a side of a page of the table
 # So many pages cover fifty kilometres times fifty with cells of 5 cm.
 _MOST_PAGES = 1 << 16
@@ -741,7 +743,7 @@ def better_score(total, count, held_against, new, weights):  # type: ignore[no-u
     return max(as_it_was, 1.0 - weights.price * (1.0 - with_new))
 
 
-@kernel
+@inlined
 def _distance_at(tiles, gx, gy):  # type: ignore[no-untyped-def]
     """Distance to the nearest surface and its gradient, bilinear; in metres, cells in."""
     ix, iy = int(gx - 0.5), int(gy - 0.5)
@@ -771,11 +773,11 @@ def _distance_at(tiles, gx, gy):  # type: ignore[no-untyped-def]
 def normal_equations(pose, points, tiles, scale):  # type: ignore[no-untyped-def]
     """Gauss-Newton terms of the robust distances of points to surfaces.
 
-    Returns the (3, 3) Hessian, the (3,) gradient, the weighted sum of squared distances
-    and the sum of weights (Geman-McClure weights of the given scale).
+    Returns the upper triangle of the Hessian, row by row, the gradient, the weighted sum of
+    squared distances and the sum of weights (Geman-McClure weights of the given scale).
     """
-    hessian = np.zeros((3, 3))
-    gradient = np.zeros(3)
+    xx, xy, xt, yy, yt, tt = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    x, y, t = 0.0, 0.0, 0.0
     squares, total = 0.0, 0.0
     c, s = math.cos(pose[2]), math.sin(pose[2])
     for i in range(len(points)):
@@ -789,28 +791,35 @@ def normal_equations(pose, points, tiles, scale):  # type: ignore[no-untyped-def
         weight = 1.0 / (1.0 + (value / scale) ** 2)
         weight *= weight
         dt = dy * rx - dx * ry
-        gradient[0] += weight * dx * value
-        gradient[1] += weight * dy * value
-        gradient[2] += weight * dt * value
-        hessian[0, 0] += weight * dx * dx
-        hessian[0, 1] += weight * dx * dy
-        hessian[0, 2] += weight * dx * dt
-        hessian[1, 1] += weight * dy * dy
-        hessian[1, 2] += weight * dy * dt
-        hessian[2, 2] += weight * dt * dt
+        x += weight * dx * value
+        y += weight * dy * value
+        t += weight * dt * value
+        xx += weight * dx * dx
+        xy += weight * dx * dy
+        xt += weight * dx * dt
+        yy += weight * dy * dy
+        yt += weight * dy * dt
+        tt += weight * dt * dt
         squares += weight * value * value
         total += weight
-    hessian[1, 0] = hessian[0, 1]
-    hessian[2, 0] = hessian[0, 2]
-    hessian[2, 1] = hessian[1, 2]
-    return hessian, gradient, squares, total
+    return (xx, xy, xt, yy, yt, tt), (x, y, t), squares, total
+
+
+@kernel
+def put_hessian(triangle, hessian):  # type: ignore[no-untyped-def]
+    """Write a Hessian of which the upper triangle is known into a (3, 3) array."""
+    xx, xy, xt, yy, yt, tt = triangle
+    hessian[0, 0], hessian[1, 1], hessian[2, 2] = xx, yy, tt
+    hessian[0, 1] = hessian[1, 0] = xy
+    hessian[0, 2] = hessian[2, 0] = xt
+    hessian[1, 2] = hessian[2, 1] = yt
 
 
 @kernel
 def _solved(h, g, damping):  # type: ignore[no-untyped-def]
-    """Solve the damped symmetric 3 x 3 system by Cramer's rule."""
-    a, b, c = h[0, 0] + damping, h[0, 1], h[0, 2]
-    d, e, f = h[1, 1] + damping, h[1, 2], h[2, 2] + damping
+    """Solve the damped symmetric 3 x 3 system by Cramer's rule; ``h`` is its upper triangle."""
+    a, b, c, d, e, f = h
+    a, d, f = a + damping, d + damping, f + damping
     p, q, r = d * f - e * e, c * e - b * f, b * e - c * d
     determinant = a * p + b * q + c * r
     x = (p * g[0] + q * g[1] + r * g[2]) / determinant
@@ -850,26 +859,35 @@ def passed_through(pose, points, tiles, margin):  # type: ignore[no-untyped-def]
     x = pose[0] / tiles.resolution - tiles.column
     y = pose[1] / tiles.resolution - tiles.row
     clear = int(_CLEAR / tiles.reach * _FAR)
-    shortly = int(2.0 * _CLEAR / tiles.resolution)
-    cells = tiles.reach / _FAR / tiles.resolution
+    shortly = math.floor(2.0 * _CLEAR / tiles.resolution)
+    skipped = _skipped(clear, tiles)
     through = 0
     for i in range(len(points)):
         length = math.hypot(points[i, 0], points[i, 1])
         dx = (c * points[i, 0] - s * points[i, 1]) / length
         dy = (s * points[i, 0] + c * points[i, 1]) / length
-        last_clear, met = -shortly, -1
-        last = int((min(length, _LONGEST_RAY) - margin) / tiles.resolution) - 1
-        k = 0
+        last_clear, met = -shortly, -1.0
+        last = math.floor((min(length, _LONGEST_RAY) - margin) / tiles.resolution) - 1.0
+        k = 0.0
         while k <= last:
             code = cell_code(tiles, int(x + k * dx), int(y + k * dy))
             if (code & _FAR) >= clear:
-                if met >= 0 and k - met <= shortly:
+                if met >= 0.0 and k - met <= shortly:
                     through += 1
                     break
-                # The corners of the two cells, and the rounding of the code.
-                k += max(int(((code & _FAR) - clear) * cells - 2.5), 0)
-                last_clear, met = k, -1
-            elif code & _SURFACE and met < 0 and k - last_clear <= shortly:
+                k += skipped[code & _63]
+                last_clear, met = k, -1.0
+            elif code & _SURFACE and met < 0.0 and k - last_clear <= shortly:
                 met = k
-            k += 1
+            k += 1.0
     return through / max(len(points), 1)
+
+
+@kernel
+def _skipped(clear, tiles):  # type: ignore[no-untyped-def]
+    """Cells of a ray, by the code of the one before them, that are clear of surfaces anyway."""
+    skipped = np.zeros(_FAR + 1)
+    for code in range(clear, _FAR + 1):
+        far = (code - clear) * tiles.reach / _FAR / tiles.resolution
+        skipped[code] = max(math.floor(far - _CORNERS), 0.0)
+    return skipped

@@ -50,7 +50,7 @@ from .reference import Reference
 from .scan import LaserScan
 from .settings import Settings
 from .simulator import SensorModel, random_building, random_poses, simulate
-from .verification import readings, verify
+from .verification import on_large, readings, verify
 
 __all__ = ["RANKS", "SIZES", "Growth", "Place", "Scene", "Size", "distractors", "measure", "slope"]
 
@@ -334,7 +334,7 @@ class _Asked:
             return False
         settings = self._settings
         seen = readings(description.angles, settings.verification)
-        large = seen[seen[:, 2] == 0.0]
+        large = on_large(seen)
         related = joined([self._landmarks[number] for number in some])
         proposed = proposals(description.anchors, large, related, self._tiles, settings.proposal)
         fits = verify(proposed.poses, seen, self._tiles, self._weights, settings.verification)

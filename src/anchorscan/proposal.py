@@ -57,6 +57,7 @@ _COSINE, _SINE = np.cos(_ANGLES), np.sin(_ANGLES)
 # A proposal in the same cell of position as one before it is the same.
 _CELL = 0.12
 _MOST = 1 << 16
+_1 = np.uint64(1)
 
 
 class ProposalSettings(BaseModel):
@@ -467,17 +468,20 @@ def _corresponding(edge, middle, group, block, known, limits, out, found):  # ty
     """Poses proposed by one edge and the edges of one block that correspond to it."""
     length, bearing, turn_a, turn_b, askew = edge
     tolerance, turn_tolerance, heading_tolerance = limits[2], limits[3], limits[4]
-    end = known.edge_starts[block, group + 1]
-    e = _lower(known.lengths, known.edge_starts[block, group], end, length - tolerance)
+    begin, end = known.edge_starts[block, group], known.edge_starts[block, group + 1]
+    # Unsigned indices spare the check for negative ones.
+    e = np.uint64(_lower(known.lengths, begin, end, length - tolerance))
+    end = np.uint64(end)
     symmetric = group % (_KINDS + 1) == 0
     while e < end and known.lengths[e] <= length + tolerance:
         for flip in range(2 if symmetric else 1):
             # With ends of one kind either may be either: the other way round is half a turn.
             half = flip * (_TURN // 2)
             first, second = (turn_a, turn_b) if flip == 0 else (turn_b, turn_a)
-            if _apart(known.turns[e, 1], first - half) > turn_tolerance:
-                continue
-            if _apart(known.turns[e, 2], second - half) > turn_tolerance:
+            # One branch for both, since a processor can foresee neither.
+            off_first = _apart(known.turns[e, 1], first - half)
+            off_second = _apart(known.turns[e, 2], second - half)
+            if max(off_first, off_second) > turn_tolerance:
                 continue
             units = known.turns[e, 0] - bearing + half
             if askew != _UNKNOWN and known.turns[e, 3] != _UNKNOWN:
@@ -494,7 +498,7 @@ def _corresponding(edge, middle, group, block, known, limits, out, found):  # ty
             )
             _put(out, found, middle, centre, units)
             found += 1
-        e += 1
+        e += _1
     return found
 
 

@@ -23,7 +23,7 @@ from .anchors import AnchorStack, stack_anchors
 from .database import RelationshipDatabase, Votes, quality
 from .decision import Decision, covariance, decide
 from .description import Description, describe
-from .evaluation import evaluate_all, stack_outlines
+from .evaluation import evaluate_outlines
 from .field import FieldArrays, LikelihoodField, Tiles
 from .graph import anchor_graph
 from .hypothesis import Hypothesis
@@ -43,7 +43,7 @@ from .proposal import (
 from .reference import Reference
 from .scan import LaserScan
 from .settings import Settings
-from .verification import Fits, follow, readings, verify
+from .verification import Fits, follow, on_large, readings, verify
 
 __all__ = ["MapSearch", "StitchedMap"]
 
@@ -264,7 +264,7 @@ class StitchedMap:
         settings, content = self._settings, self._content
         tiles = content.tiles
         seen = readings(description.angles, settings.verification)
-        large = seen[seen[:, 2] == 0.0]
+        large = on_large(seen)
         votes = None if most is None else self._candidates(description, most, content)
         related = content.landmarks if votes is None else self._some(votes.references, content)
         proposed = proposals(description.anchors, large, related, tiles, settings.proposal)
@@ -303,19 +303,12 @@ class StitchedMap:
         settings = self._settings
         count = min(len(fits), settings.acceptance.hypotheses)
         numbers, places, T_reference_scan = nearest(content.lots, fits.poses[:count])
-        if np.any(numbers < 0):  # the last reference was removed meanwhile
+        if -1 in numbers.tolist():  # the last reference was removed meanwhile
             return (), []
         known = [
             self._know(content.lots[n], k)
             for n, k in zip(numbers.tolist(), places.tolist(), strict=True)
         ]
-        e_m = evaluate_all(
-            description.outline,
-            stack_outlines([each.description.outline for each in known]),
-            np.arange(count),
-            T_reference_scan,
-            settings.evaluation,
-        )
         covariances = covariance(fits[:count], settings.decision)
         hypotheses = tuple(
             Hypothesis(
@@ -323,7 +316,12 @@ class StitchedMap:
                 pose_in_reference=Pose2D(*T_reference_scan[n].tolist()),
                 pose=Pose2D(*fits.poses[n].tolist()),
                 covariance=covariances[n],
-                evaluation=float(e_m[n]),
+                evaluation=evaluate_outlines(
+                    description.outline,
+                    each.description.outline,
+                    T_reference_scan[n],
+                    settings.evaluation,
+                ),
                 quality=quality(description.graph, each.description.graph, settings.database),
                 score=float(fits.features[n, 0]),
                 probability=float(decision.probabilities[n]),

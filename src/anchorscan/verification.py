@@ -36,10 +36,11 @@ from .field import (
     field_scores,
     normal_equations,
     passed_through,
+    put_hessian,
     refined,
 )
 from .proposal import spread
-from .segments import is_small
+from .segments import _is_small
 
 __all__ = [
     "FEATURES",
@@ -47,6 +48,7 @@ __all__ = [
     "Fits",
     "VerificationSettings",
     "follow",
+    "on_large",
     "readings",
     "verify",
     "worth",
@@ -128,11 +130,36 @@ def readings(angles: AngleFunction, settings: VerificationSettings) -> NDArray[n
     free space, a wall may not.  A scan that shows hardly anything large has to go by what
     it shows.
     """
-    small = is_small(angles, settings.small_extent)
-    large = len(small) - int(np.count_nonzero(small))
+    told: NDArray[np.float64] = _readings(
+        angles.points, angles.runs, angles.way, settings.small_extent
+    )
+    return told
+
+
+@kernel
+def on_large(readings):  # type: ignore[no-untyped-def]
+    """Those of (N, 3) readings that are not on small things."""
+    large = np.empty(readings.shape)
+    found = 0
+    for i in range(len(readings)):
+        if readings[i, 2] == 0.0:
+            for j in range(3):
+                large[found, j] = readings[i, j]
+            found += 1
+    return large[:found]
+
+
+@kernel
+def _readings(points, runs, way, extent):  # type: ignore[no-untyped-def]
+    """Points, and 1 for those on small things, unless hardly any are not."""
+    small = _is_small(runs, way, extent)
+    large = len(small) - np.count_nonzero(small)
     if large < _FEWEST_LARGE or large < _SMALLEST_SHARE * len(small):
-        small = np.zeros(len(small), np.bool_)
-    return np.column_stack((angles.points, small))
+        small[:] = False
+    told = np.empty((len(points), 3))
+    for i in range(len(points)):
+        told[i, 0], told[i, 1], told[i, 2] = points[i, 0], points[i, 1], small[i]
+    return told
 
 
 def verify(
@@ -294,7 +321,7 @@ def _fit(poses, readings, tiles, weights, steps, places, rays):  # type: ignore[
     residuals = np.empty(len(order))
     for k in range(len(order)):
         hessian, _, squares, total = normal_equations(moved[k], few, tiles, 0.1)
-        hessians[k] = hessian
+        put_hessian(hessian, hessians[k])
         residuals[k] = squares / max(total, 1.0)
     return moved, features, hessians, residuals
 
@@ -315,24 +342,33 @@ def _follow(poses, stiffness, readings, tiles, weights, steps, rays):  # type: i
         _features(moved[k], many, tiles, weights, features[k])
         features[k, 5] = passed_through(moved[k], followed, tiles, rays[1])
         hessian, _, squares, total = normal_equations(moved[k], few, tiles, 0.1)
-        hessians[k] = hessian
+        put_hessian(hessian, hessians[k])
         residuals[k] = squares / max(total, 1.0)
     return moved, features, hessians, residuals
 
 
 @kernel
-def _held_back(pose, stiffness, points, tiles, iterations):  # type: ignore[no-untyped-def]
-    """Move a pose as `refined` does, drawn back to where it was by a stiffness."""
+def _held_back(pose, k, points, tiles, iterations):  # type: ignore[no-untyped-def]
+    """Move a pose as `refined` does, drawn back to where it was by a stiffness ``k``."""
     moved = pose.copy()
     for step in range(iterations):
         scale = 0.2 if 2 * step < iterations else 0.1
         hessian, gradient, _, _ = normal_equations(moved, points, tiles, scale)
-        off = moved - pose
-        off[2] = wrapped(off[2])
-        for i in range(3):
-            for j in range(3):
-                gradient[i] += stiffness[i, j] * off[j]
-                hessian[i, j] += stiffness[i, j]
+        xx, xy, xt, yy, yt, tt = hessian
+        hessian = (
+            xx + k[0, 0],
+            xy + k[0, 1],
+            xt + k[0, 2],
+            yy + k[1, 1],
+            yt + k[1, 2],
+            tt + k[2, 2],
+        )
+        off = (moved[0] - pose[0], moved[1] - pose[1], wrapped(moved[2] - pose[2]))
+        gradient = (
+            gradient[0] + k[0, 0] * off[0] + k[0, 1] * off[1] + k[0, 2] * off[2],
+            gradient[1] + k[1, 0] * off[0] + k[1, 1] * off[1] + k[1, 2] * off[2],
+            gradient[2] + k[2, 0] * off[0] + k[2, 1] * off[1] + k[2, 2] * off[2],
+        )
         x, y, theta = _solved(hessian, gradient, 1.0)
         size = math.hypot(x, y)
         share = 1.0 if size < 0.1 else 0.1 / size
