@@ -75,7 +75,7 @@ class DecisionSettings(BaseModel):
         0.03, gt=0.0, description="least standard deviation of a reading, metres"
     )
     readings_alike: float = Field(
-        3.0, ge=1.0, description="readings that err together: so many count as one"
+        1.8, ge=1.0, description="readings that err together: so many count as one"
     )
     widest_deviation: float = Field(
         5.0, gt=0.0, description="standard deviation where nothing holds the pose, metres, radians"

@@ -96,6 +96,7 @@ PRESETS: Mapping[str, Mapping[str, Any]] = types.MappingProxyType(
                 "through": -3.65,
                 "heading": 0.80,
                 "anchors": 0.71,
+                "readings_alike": 3.0,
             },
         },
     }
