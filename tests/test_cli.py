@@ -190,7 +190,7 @@ def test_a_window_of_scans_tracks_as_well(
 def test_processes_share_the_work_and_change_nothing(log: Path, places: Path) -> None:
     # In processes of their own: pytest's captured streams do not survive a spawn.
     outcomes = []
-    for count in ("1", "2", "all"):
+    for count in ("1", "all"):
         done = subprocess.run(
             command("locate", places, log, "--processes", count),
             capture_output=True,
@@ -198,7 +198,7 @@ def test_processes_share_the_work_and_change_nothing(log: Path, places: Path) ->
             check=True,
         )
         outcomes.append(without_time(Outcome(0, done.stdout, "").lines))
-    assert outcomes[0] == outcomes[1] == outcomes[2]
+    assert outcomes[0] == outcomes[1]
 
 
 def without_time(lines: list[dict[str, Any]]) -> list[dict[str, Any]]:

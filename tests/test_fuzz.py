@@ -54,11 +54,10 @@ def test_a_target_that_hangs_or_hoards_is_caught(tmp_path: Path) -> None:
             execute(Target("hoard", list, hoard), b"a", tmp_path)
 
 
-@pytest.mark.parametrize("name", ["settings", "csv"])
-def test_the_command_counts_its_executions(name: str, tmp_path: Path) -> None:
+def test_the_command_counts_its_executions() -> None:
     import subprocess
 
-    words = ["-m", "fuzz", name, "--runs", "50", "--engine", "random", "--findings", "found"]
+    words = ["-m", "fuzz", "csv", "--runs", "50", "--engine", "random", "--findings", "found"]
     home = Path(__file__).parent
     done = subprocess.run(
         [sys.executable, *words],
@@ -68,5 +67,5 @@ def test_the_command_counts_its_executions(name: str, tmp_path: Path) -> None:
         env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
         check=True,
     )
-    assert f"{name}: 50 executions" in done.stdout
+    assert "csv: 50 executions" in done.stdout
     assert importlib.util.find_spec("fuzz") is not None

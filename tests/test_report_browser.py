@@ -21,7 +21,7 @@ from selenium import webdriver  # noqa: E402 - only where selenium is there
 from selenium.webdriver.common.action_chains import ActionChains  # noqa: E402
 from selenium.webdriver.common.by import By  # noqa: E402
 from selenium.webdriver.common.keys import Keys  # noqa: E402
-from selenium.webdriver.support.ui import Select  # noqa: E402
+from selenium.webdriver.support.ui import Select, WebDriverWait  # noqa: E402
 
 CHROMIUM = next(
     filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None
@@ -315,8 +315,8 @@ def test_dark_is_dark(show: Callable[..., Shown], office: Any) -> None:
     try:
         assert light > 200.0
         assert brightness() < 60.0
-        # The canvases follow: the scan is drawn in the colour of the dark theme.
-        assert (86, 180, 233) in page.colours("overlay")
+        # The canvases follow a little later: the scan is drawn in the colour of the dark theme.
+        WebDriverWait(page.browser, 30.0).until(lambda _: (86, 180, 233) in page.colours("overlay"))
     finally:
         page.browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": []})
 
