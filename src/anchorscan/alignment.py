@@ -149,13 +149,9 @@ def correspondences(
     """Find all pairs of edges whose lengths differ by at most ``tolerance`` (metres)."""
     return Correspondences(
         *_correspondences(
-            references.lengths,
-            references.directions,
-            references.nodes,
+            (references.lengths, references.directions, references.nodes, references.positions),
             references.edge_starts,
-            graph.lengths,
-            graph.directions,
-            graph.nodes,
+            (graph.lengths, graph.directions, graph.nodes, graph.anchors.positions),
             tolerance,
         )
     )
@@ -163,60 +159,17 @@ def correspondences(
 
 def align(graph: AnchorGraph, references: GraphStack, settings: AlignmentSettings) -> Alignment:
     """Align a graph with every candidate reference (section 4.2)."""
-    pairs = correspondences(graph, references, settings.length_tolerance)
-    histograms = _histograms(pairs.turns, pairs.starts, settings.histogram_bins)
-    peaks = _peaks(histograms, settings.histogram_peaks, settings.turn_tolerance)
-    kept, kept_starts = _near_peaks(pairs.turns, pairs.starts, peaks, settings.turn_tolerance)
-    nodes = pairs.nodes[kept]
-    columns = len(graph.anchors)
-    matrices, matrix_starts = _matrices(
-        nodes, kept_starts, references.node_starts, columns, settings.histogram_peaks
-    )
-    maxima = _maxima(matrices, matrix_starts, columns, settings.matrix_peaks)
-    contributions, starts = _contributions(
-        nodes,
-        kept_starts,
-        maxima,
-        references.positions,
+    found = _align(
+        (graph.lengths, graph.directions, graph.nodes, graph.anchors.positions),
+        (references.lengths, references.directions, references.nodes, references.positions),
+        references.edge_starts,
         references.node_starts,
-        graph.anchors.positions,
+        (settings.length_tolerance, settings.turn_tolerance),
+        (settings.histogram_bins, settings.histogram_peaks, settings.matrix_peaks),
+        (settings.cluster_distance, settings.cluster_turn),
     )
-    size = (settings.cluster_distance, settings.cluster_turn)
-    centres, in_cluster = _clusters(contributions, starts, size)
-    branches = np.arange(len(maxima)) // settings.matrix_peaks
-    sizes = np.diff(starts)
-    distinct = _distinct(centres, sizes, branches // settings.histogram_peaks, size)
-    branches = branches[distinct]
-    poses, support, scatter = _unified(
-        nodes,
-        kept_starts,
-        references.positions,
-        references.node_starts,
-        graph.anchors.positions,
-        centres[distinct],
-        branches,
-        size,
-    )
-    candidates = branches // settings.histogram_peaks
-    distinct = _distinct(poses, support, candidates, size)
-    return Alignment(
-        pairs,
-        histograms,
-        peaks,
-        kept,
-        kept_starts,
-        matrices,
-        matrix_starts,
-        columns,
-        maxima,
-        contributions,
-        starts,
-        in_cluster,
-        candidates[distinct],
-        poses[distinct],
-        support[distinct],
-        scatter[distinct],
-    )
+    pairs, branches, hypotheses, alignments = found
+    return Alignment(Correspondences(*pairs), *branches, *hypotheses, *alignments)
 
 
 # Squared distance, in units of the cluster's size, that is nothing but rounding.
@@ -224,8 +177,52 @@ _ROUNDING = 1e-12
 
 
 @kernel
-def _correspondences(lengths, directions, nodes, starts, others, bearings, ends, tolerance):  # type: ignore[no-untyped-def]
+def _align(graph, references, edge_starts, node_starts, tolerances, counts, size):  # type: ignore[no-untyped-def]
+    """All steps: what ``Correspondences`` and ``Alignment`` hold, in their order."""
+    length_tolerance, turn_tolerance = tolerances
+    bins, histogram_peaks, matrix_peaks = counts
+    points, positions = graph[3], references[3]
+    pairs = _correspondences(references, edge_starts, graph, length_tolerance)
+    _, all_nodes, turns, starts = pairs
+    histograms = _histograms(turns, starts, bins)
+    peaks = _peaks(histograms, histogram_peaks, turn_tolerance)
+    kept, kept_starts = _near_peaks(turns, starts, peaks, turn_tolerance)
+    nodes = all_nodes[kept]
+    columns = len(points)
+    matrices, matrix_starts = _matrices(nodes, kept_starts, node_starts, columns, histogram_peaks)
+    maxima = _maxima(matrices, matrix_starts, columns, matrix_peaks)
+    contributions, group_starts = _contributions(
+        nodes, kept_starts, maxima, positions, node_starts, points
+    )
+    centres, in_cluster = _clusters(contributions, group_starts, size)
+    branches = np.arange(len(maxima)) // matrix_peaks
+    distinct = _distinct(centres, np.diff(group_starts), branches // histogram_peaks, size)
+    branches = branches[distinct]
+    poses, support, scatter = _unified(
+        nodes,
+        kept_starts,
+        positions,
+        node_starts,
+        points,
+        centres[distinct],
+        branches,
+        size,
+    )
+    candidates = branches // histogram_peaks
+    distinct = _distinct(poses, support, candidates, size)
+    return (
+        pairs,
+        (histograms, peaks, kept, kept_starts, matrices, matrix_starts, columns),
+        (maxima, contributions, group_starts, in_cluster),
+        (candidates[distinct], poses[distinct], support[distinct], scatter[distinct]),
+    )
+
+
+@kernel
+def _correspondences(references, starts, graph, tolerance):  # type: ignore[no-untyped-def]
     """Pairs of edges of similar length: edges, nodes, turns modulo pi, start per candidate."""
+    lengths, directions, nodes, _ = references
+    others, bearings, ends, _ = graph
     pair_starts = np.zeros(len(starts), np.int64)
     pairs = np.int64(0)
     for c in range(len(starts) - 1):

@@ -292,15 +292,28 @@ def _in_order(
     most: int | None,
 ) -> tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.float64]]:
     """Order slots by quality: identifiers, counts and qualities of the first ones."""
-    alive = np.flatnonzero(state.sizes[slots] >= 0)
-    slots, counts = slots[alive], counts[alive]
-    identifiers = state.identifiers[slots]
-    pairs = float(edges[0]) * np.maximum(state.sizes[slots], edges[1])
-    quality = np.divide(
-        counts.astype(np.float64) ** 2, pairs, out=np.zeros(len(alive)), where=pairs > 0
-    )
+    identifiers, counts, quality = _qualities(slots, counts, state.identifiers, state.sizes, edges)
     order = np.lexsort((identifiers, -quality))[:most]
     return identifiers[order], counts[order], quality[order]
+
+
+@kernel
+def _qualities(slots, counts, identifiers, sizes, edges):  # type: ignore[no-untyped-def]
+    """Identifiers, counts and qualities of those slots whose reference is not removed."""
+    alive = np.empty(len(slots), np.int64)
+    found = np.empty(len(slots), np.float32)
+    quality = np.zeros(len(slots))
+    used = 0
+    for k in range(len(slots)):
+        size = sizes[slots[k]]
+        if size < 0:
+            continue
+        alive[used], found[used] = identifiers[slots[k]], counts[k]
+        pairs = np.float64(edges[0]) * max(size, edges[1])
+        if pairs > 0.0:
+            quality[used] = np.float64(counts[k]) ** 2 / pairs
+        used += 1
+    return alive[:used], found[:used], quality[:used]
 
 
 def _with_room(values: NDArray[Number], slot: int) -> NDArray[Number]:

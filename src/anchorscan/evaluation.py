@@ -22,6 +22,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import accumulate
 
 import numpy as np
 from numpy.typing import NDArray
@@ -59,6 +60,21 @@ _X, _Y, _RANGE, _BEAM, _GAP = range(5)
 _FULL_TURN = 2.0 * math.pi
 # A beam that misses the end of a line by less than this share of a step still meets it.
 _SLACK = 1e-6
+# Coefficients of the arc tangent over its argument t by powers of t squared, the highest first:
+# interpolated at Chebyshev's points for t up to the tangent of an eighth of pi.
+_STEEP, _TINY = math.tan(math.pi / 8.0), 1e-300
+_ARC = (
+    -0.025345761550124298,
+    0.05030301131043306,
+    -0.06508962196078676,
+    0.07674293552076389,
+    -0.09089635821705612,
+    0.11111057303795945,
+    -0.14285713038303977,
+    0.19999999986904501,
+    -0.3333333333329765,
+    1.0000000000000002,
+)
 # So near its own position, metres, a scan sees every position.
 _HERE = 0.1
 
@@ -159,8 +175,8 @@ def stack_outlines(outlines: Sequence[Outline]) -> OutlineStack:
     """Put outlines one behind the other; none at all gives an empty stack."""
     return OutlineStack(
         np.concatenate([_NO_ROWS, *(each.rows for each in outlines)]),
-        np.cumsum([0, *(len(each.rows) for each in outlines)]),
-        np.concatenate([_NO_GEOMETRIES, *(each.geometry[np.newaxis] for each in outlines)]),
+        np.array([0, *accumulate(len(each.rows) for each in outlines)], np.int64),
+        np.array([each.geometry for each in outlines]).reshape(-1, 4),
     )
 
 
@@ -306,7 +322,6 @@ def synthetic_scan(
 
 
 _NO_ROWS = np.empty((0, 5))
-_NO_GEOMETRIES = np.empty((0, 4))
 
 
 @kernel
@@ -389,22 +404,13 @@ def _render(rows, pose, geometry, inverse):  # type: ignore[no-untyped-def]
     count = len(rows)
     if count == 0:
         return
-    first, step = geometry[0], geometry[1]
+    step = geometry[1]
     period = _FULL_TURN / step
-    c, s = math.cos(pose[2]), math.sin(pose[2])
-    last = count - 1
-    x = c * rows[last, _X] - s * rows[last, _Y] + pose[0]
-    y = s * rows[last, _X] + c * rows[last, _Y] + pose[1]
-    k = _positive(math.atan2(y, x) - first) / step
-    over = 1.0 / max(math.sqrt(x * x + y * y), _SLACK)
-    joined = rows[last, _GAP] == CONNECTED
+    coordinates, inverse_ranges = _carried(rows, pose, geometry)
+    k, over, joined = coordinates[-1], inverse_ranges[-1], rows[-1, _GAP] == CONNECTED
     for i in range(count):
         k_before, over_before, joined_before = k, over, joined
-        x = c * rows[i, _X] - s * rows[i, _Y] + pose[0]
-        y = s * rows[i, _X] + c * rows[i, _Y] + pose[1]
-        k = _positive(math.atan2(y, x) - first) / step
-        over = 1.0 / max(math.sqrt(x * x + y * y), _SLACK)
-        joined = rows[i, _GAP] == CONNECTED
+        k, over, joined = coordinates[i], inverse_ranges[i], rows[i, _GAP] == CONNECTED
         if joined_before:
             span = k - k_before
             if span > 0.5 * period:
@@ -418,6 +424,44 @@ def _render(rows, pose, geometry, inverse):  # type: ignore[no-untyped-def]
         if not (joined_before and joined):
             # The margin of a surface reaches half a beam beyond its last reading.
             _draw(k - 0.5 + _SLACK, 1.0 - 3.0 * _SLACK, over, over, step, period, inverse)
+
+
+@kernel
+def _carried(rows, pose, geometry):  # type: ignore[no-untyped-def]
+    """Beam coordinate and inverse range of every return of an outline carried by ``pose``.
+
+    Two loops, since a processor does several returns at once in the second.
+    """
+    first, step = geometry[0], geometry[1]
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    x, y = np.empty(len(rows)), np.empty(len(rows))
+    for i in range(len(rows)):
+        x[i] = c * rows[i, _X] - s * rows[i, _Y] + pose[0]
+        y[i] = s * rows[i, _X] + c * rows[i, _Y] + pose[1]
+    for i in range(len(rows)):
+        u, v = x[i], y[i]
+        angle = _direction(u, v) - first
+        x[i] = (angle - _FULL_TURN * np.floor(angle / _FULL_TURN)) / step
+        y[i] = 1.0 / max(math.sqrt(u * u + v * v), _SLACK)
+    return x, y
+
+
+@inlined
+def _direction(x, y):  # type: ignore[no-untyped-def]
+    """``math.atan2(y, x)`` to a few units in the last place, without a branch or a call."""
+    along, across = abs(x), abs(y)
+    low, high = min(along, across), max(along, across)
+    # Beyond an eighth of pi the angle to the diagonal is the smaller one.
+    steep = low > _STEEP * high
+    t = (low - high if steep else low) / (low + high if steep else max(high, _TINY))
+    z = t * t
+    series = _ARC[4] + z * (_ARC[3] + z * (_ARC[2] + z * (_ARC[1] + z * _ARC[0])))
+    series = _ARC[7] + z * (_ARC[6] + z * (_ARC[5] + z * series))
+    angle = t * (_ARC[9] + z * (_ARC[8] + z * series))
+    angle = angle + 0.25 * math.pi if steep else angle
+    angle = 0.5 * math.pi - angle if across > along else angle
+    angle = math.pi - angle if x < 0.0 else angle
+    return -angle if y < 0.0 else angle
 
 
 @inlined

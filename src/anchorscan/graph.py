@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import accumulate
 
 import numpy as np
 from numpy.typing import NDArray
@@ -105,8 +106,8 @@ def stack(graphs: Sequence[AnchorGraph]) -> GraphStack:
         np.concatenate([_NO_NODES, *(graph.nodes for graph in graphs)]),
         np.concatenate([_NO_VALUES, *(graph.lengths for graph in graphs)]),
         np.concatenate([_NO_VALUES, *(graph.directions for graph in graphs)]),
-        np.cumsum([0, *(len(graph.anchors.positions) for graph in graphs)]),
-        np.cumsum([0, *(len(graph.lengths) for graph in graphs)]),
+        np.array([0, *accumulate(len(graph.anchors) for graph in graphs)], np.int64),
+        np.array([0, *accumulate(len(graph.lengths) for graph in graphs)], np.int64),
     )
 
 

@@ -54,6 +54,8 @@ _HEADINGS = 256
 _TRIGONOMETRY = 1 << 12
 _ANGLES = (np.arange(_TRIGONOMETRY) + 0.5) * (2.0 * math.pi / _TRIGONOMETRY)
 _COSINE, _SINE = np.cos(_ANGLES), np.sin(_ANGLES)
+_HEADING = (np.arange(_HEADINGS) + 0.5) * 2.0 * math.pi / _HEADINGS
+_HEADING_COSINE, _HEADING_SINE = np.cos(_HEADING), np.sin(_HEADING)
 # A proposal in the same cell of position as one before it is the same.
 _CELL = 0.12
 _MOST = 1 << 16
@@ -387,8 +389,7 @@ def _rotated(points, tiles):  # type: ignore[no-untyped-def]
     table = np.empty((_HEADINGS, len(points), 2), np.float32)
     scale = 0.25 / tiles.resolution
     for h in range(_HEADINGS):
-        theta = (h + 0.5) * 2.0 * math.pi / _HEADINGS
-        c, s = math.cos(theta) * scale, math.sin(theta) * scale
+        c, s = _HEADING_COSINE[h] * scale, _HEADING_SINE[h] * scale
         for i in range(len(points)):
             table[h, i, 0] = c * points[i, 0] - s * points[i, 1]
             table[h, i, 1] = s * points[i, 0] + c * points[i, 1]
