@@ -17,12 +17,16 @@ from anchorscan.evaluation import (
     clearance,
     evaluate,
     evaluate_all,
+    evaluate_outlines,
     outline,
     probability,
     stack_outlines,
     synthetic_scan,
 )
+from anchorscan.evaluation import _direction as direction
 from anchorscan.simulator import random_poses
+
+coordinates = st.floats(-1e6, 1e6).filter(lambda value: value == 0.0 or abs(value) > 1e-9)
 
 SURFACES = AngleFunctionSettings()
 SENSORS = (
@@ -189,6 +193,13 @@ def test_many_alignments_at_once_are_those_of_each_alone(seed):
             EvaluationSettings(),
         )
         assert together[k] == alone[0]
+        assert together[k] == evaluate_outlines(ours, theirs[k], poses[k], EvaluationSettings())
+
+
+@given(coordinates, coordinates)
+def test_directions_are_those_of_the_arc_tangent(x, y):
+    off = direction(x, y) - math.atan2(y, x)
+    assert abs(math.remainder(off, 2.0 * math.pi)) < 2e-15
 
 
 def test_true_alignments_in_one_room_agree_and_wrong_ones_do_not():

@@ -12,9 +12,19 @@ from hypothesis import strategies as st
 from scans import FULL_TURN, WIDE, building, seeds, small_room
 
 from anchorscan import Pose2D, Settings, simulate
+from anchorscan.angle_function import AngleFunctionSettings, angle_function
 from anchorscan.field import LikelihoodField, cell_code, field_scores, passed_through, refined
 from anchorscan.proposal import spread
-from anchorscan.verification import FEATURES, Fits, VerificationSettings, verify, worth
+from anchorscan.segments import is_small
+from anchorscan.verification import (
+    FEATURES,
+    Fits,
+    VerificationSettings,
+    on_large,
+    readings,
+    verify,
+    worth,
+)
 from anchorscan.verification import _distinct as distinct
 
 FIELD = Settings.preset("default").field
@@ -155,6 +165,19 @@ def test_poses_go_through_the_sieves_as_the_twins_say(mapped, seed, limits, coun
     tiles, asked = mapped
     scan, pose = asked[seed % len(asked)]
     check_against_twin(around(pose, np.random.default_rng(seed), count), mixed(scan), tiles, limits)
+
+
+@given(seeds, st.floats(0.0, 30.0))
+def test_readings_are_on_small_things_unless_hardly_any_are_not(mapped, seed, extent):
+    scan, _ = mapped[1][seed % len(mapped[1])]
+    angles = angle_function(scan, AngleFunctionSettings())
+    small = is_small(angles, extent)
+    large = int(np.sum(~small))
+    if large < 20 or large < 0.25 * len(small):
+        small = np.zeros(len(small))
+    told = readings(angles, VerificationSettings(small_extent=extent))
+    np.testing.assert_array_equal(told, np.column_stack((angles.points, small)))
+    np.testing.assert_array_equal(on_large(told), told[told[:, 2] == 0.0])
 
 
 @given(seeds, st.integers(0, 30), st.integers(1, 8))
