@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import json
+import zlib
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -60,6 +63,24 @@ def test_no_changed_byte_goes_unnoticed(tmp_path):
         path.write_bytes(changed)
         read = read_arrays(path, "scans")
         assert read is None or np.array_equal(next(iter(read.values())), ARRAYS["keys"][:20])
+
+
+def test_a_head_that_was_changed_with_care_is_useless_too(tmp_path):
+    """Its checksum is right, but an array lies over the next one, or in the room behind it."""
+    path = tmp_path / "index"
+    write_arrays(path, {"a": np.zeros((4, 8)), "b": np.ones((4, 8))}, "scans", {"a": 2})
+    assert read_arrays(path, "scans")["a"].shape == (6, 8)
+    magic, line, rest = path.read_bytes().split(b"\n", 2)
+    head = json.loads(line[9:])
+    for change in ({"shape": [9, 8]}, {"offset": head["arrays"]["b"]["offset"]}):
+        crafted = {"a": head["arrays"]["a"] | change, "b": head["arrays"]["b"]}
+        crafted["a"]["crc32"] = [
+            zlib.crc32(np.ones((4, 8)).data if "offset" in change else bytes(256))
+        ]
+        told = json.dumps(head | {"arrays": crafted}).encode().ljust(len(line) - 9)
+        checksum = b"%08x " % zlib.crc32(told + b"\n")
+        path.write_bytes(b"\n".join([magic, checksum + told, rest]))
+        assert read_arrays(path, "scans") is None
 
 
 @pytest.mark.parametrize("left", [0, 5, 20, 100, -1])

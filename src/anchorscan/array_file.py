@@ -1,7 +1,8 @@
 """Derived arrays in one file, memory-mapped where they are read: an index that can be thrown away.
 
-A short line of JSON says what the file was made of and where every array lies, how large it is
-and what its checksum is; the arrays follow, each at a multiple of 64 bytes, little endian.
+A short line of JSON, behind its own checksum, says what the file was made of and where every array
+lies, how large it is and what its checksum is; the arrays follow, each at a multiple of 64 bytes,
+little endian.  None may lie over another, and the room behind one is nobody else's.
 Nothing in the file is code and nothing is pickled.  A file is written beside its place and
 renamed, so that readers see the old one or the new one, and keep the one that they have opened.
 Who changes a file in its place instead, or cuts it short, pulls it from under its readers: the
@@ -21,7 +22,7 @@ import os
 import secrets
 import time
 import zlib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
@@ -32,10 +33,12 @@ from numpy.typing import NDArray
 
 __all__ = ["read_arrays", "write_arrays"]
 
-_MAGIC = b"anchorscan arrays 1\n"
+_MAGIC = b"anchorscan arrays 2\n"
 _ALIGNED = 64
 # The head is read whole: longer ones are damage.
 _LONGEST_HEAD = 1 << 20
+# Its checksum: eight digits and a blank.
+_CHECKSUM = 9
 # Checksums are of pieces of so many bytes, so that several threads can share an array.
 _PIECE = 1 << 24
 _THREADS = 4
@@ -103,16 +106,21 @@ def read_arrays(path: Path, made_of: str, *, verify: bool = True) -> dict[str, N
         with path.open("rb") as stream:
             if stream.read(len(_MAGIC)) != _MAGIC:
                 return None
-            line = stream.readline(_LONGEST_HEAD)
+            checksum, _, line = stream.readline(_LONGEST_HEAD).partition(b" ")
             size = os.fstat(stream.fileno()).st_size
             whole = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_COPY)
     except (OSError, ValueError):
         return None
     try:
+        if int(checksum, 16) != zlib.crc32(line):
+            return None
         head = json.loads(line)
         if head["made_of"] != made_of or head["bytes"] != size:
             return None
         mapped = {name: _mapped(whole, entry) for name, entry in head["arrays"].items()}
+        _see_apart(
+            [(entry["offset"], mapped[name].nbytes) for name, entry in head["arrays"].items()]
+        )
         if verify:
             _verify({name: (mapped[name], entry) for name, entry in head["arrays"].items()})
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError, OverflowError):
@@ -141,7 +149,7 @@ def _head(
 ) -> tuple[bytes, dict[str, int], int]:
     """Return the line that says what lies where, the offsets in it, and the length of the file."""
     with ThreadPoolExecutor(_THREADS) as threads:
-        checksums = {name: list(threads.map(zlib.crc32, _pieces(a))) for name, a in arrays.items()}
+        checksums = {name: _checksums(array, threads) for name, array in arrays.items()}
     entries: dict[str, dict[str, Any]] = {
         name: {
             "dtype": array.dtype.str,
@@ -154,14 +162,15 @@ def _head(
     }
     head: dict[str, Any] = {"made_of": made_of, "bytes": 0, "arrays": entries}
     # Room for the numbers that follow from the length of the line itself.
-    length = len(json.dumps(head)) + 24 * (len(entries) + 1)
+    length = _CHECKSUM + len(json.dumps(head)) + 24 * (len(entries) + 1)
     end = len(_MAGIC) + length
     for entry in entries.values():
         entry["offset"] = _aligned(end)
         end = _aligned(end) + math.prod(entry["shape"]) * np.dtype(entry["dtype"]).itemsize
     head["bytes"] = end
     offsets = {name: entry["offset"] for name, entry in entries.items()}
-    return json.dumps(head).encode().ljust(length - 1) + b"\n", offsets, end
+    line = json.dumps(head).encode().ljust(length - _CHECKSUM - 1) + b"\n"
+    return b"%08x " % zlib.crc32(line) + line, offsets, end
 
 
 def _mapped(whole: mmap.mmap, entry: Mapping[str, Any]) -> NDArray[Any]:
@@ -190,8 +199,27 @@ def _verify(arrays: Mapping[str, tuple[NDArray[Any], Mapping[str, Any]]]) -> Non
     """
     with ThreadPoolExecutor(_THREADS) as threads:
         for array, entry in arrays.values():
-            if list(threads.map(zlib.crc32, _pieces(array[: entry["rows"]]))) != entry["crc32"]:
+            if _checksums(array[: entry["rows"]], threads) != entry["crc32"]:
                 raise ValueError("an array is damaged")
+
+
+def _see_apart(places: Iterable[tuple[int, int]]) -> None:
+    """See that no array lies over another: writing to one would change it.
+
+    Raises:
+        ValueError: One does.
+    """
+    end = 0
+    for offset, size in sorted(places):
+        if size and offset < end:
+            raise ValueError("two arrays in one place")
+        end = max(end, offset + size)
+
+
+def _checksums(array: NDArray[Any], threads: ThreadPoolExecutor) -> list[int]:
+    """Checksums of the pieces of an array; threads for one piece would cost more than it."""
+    pieces = _pieces(array)
+    return list((threads.map if len(pieces) > 1 else map)(zlib.crc32, pieces))
 
 
 def _pieces(array: NDArray[Any]) -> list[memoryview]:

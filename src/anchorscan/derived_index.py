@@ -61,33 +61,34 @@ _STAGES = (
 )
 _SECTIONS = ("method", "anchors", "graph", "database", "field")
 _PROPOSAL = ("shortest_edge", "longest_edge", "landmark_cell", "landmark_turn")
-# What the arrays are of; the relationship database looks at its own.
-_INTEGERS = (
-    *("references.identifiers", "references.checksums", "scans.starts", "names.starts"),
-    *("anchors.kinds", "anchors.starts", "landmarks.starts", "landmarks.edge_starts"),
-    "field.evidence_starts",
-)
-_FLOATS = (
-    *("references.poses", "scans.geometries", "anchors.positions", "anchors.directions"),
-    *("anchors.main_angles", "landmarks.positions"),
-)
-_OTHERS = {
-    **{
-        "scans.ranges": np.float32,
-        "references.panoramas": np.uint8,
-        "scans.sensors": np.int32,
-        "names.text": np.uint8,
-    },
-    **{"landmarks.directions": np.int16, "landmarks.turns": np.int16},
-    **{"landmarks.edges": np.int32, "landmarks.lengths": np.float32},
-    **{"field.squares": np.int32, "field.codes": np.uint8, "field.coarse": np.int8},
-    "field.evidence": np.uint8,
+# What the arrays are of, and in how many dimensions; the relationship database looks at its own.
+_ROWS: Mapping[str, Any] = {
+    **dict.fromkeys(("references.identifiers", "references.checksums"), np.int64),
+    **dict.fromkeys(("scans.starts", "names.starts"), np.int64),
+    **dict.fromkeys(("anchors.kinds", "anchors.starts", "field.evidence_starts"), np.int64),
+    **dict.fromkeys(("anchors.directions", "anchors.main_angles"), np.float64),
+    **dict.fromkeys(("scans.ranges", "landmarks.lengths"), np.float32),
+    **dict.fromkeys(("names.text", "field.evidence"), np.uint8),
+    "scans.sensors": np.int32,
 }
-_TYPES: Mapping[str, Any] = {
-    **dict.fromkeys(_INTEGERS, np.int64),
-    **dict.fromkeys(_FLOATS, np.float64),
-    **_OTHERS,
+_TABLES: Mapping[str, Any] = {
+    **dict.fromkeys(("landmarks.starts", "landmarks.edge_starts"), np.int64),
+    **dict.fromkeys(("references.poses", "scans.geometries"), np.float64),
+    **dict.fromkeys(("anchors.positions", "landmarks.positions"), np.float64),
+    **dict.fromkeys(("landmarks.edges", "field.squares"), np.int32),
+    **dict.fromkeys(("landmarks.directions", "landmarks.turns"), np.int16),
+    **dict.fromkeys(("references.panoramas", "field.codes"), np.uint8),
+    "field.coarse": np.int8,
 }
+_KINDS = {
+    **{name: (np.dtype(kind), 1) for name, kind in _ROWS.items()},
+    **{name: (np.dtype(kind), 2) for name, kind in _TABLES.items()},
+}
+# What kernels make places of, and how large it may be: far more than any building, and few enough
+# cells to be counted.
+_PLACES = ("references.poses", "anchors.positions", "anchors.directions", "landmarks.positions")
+_FARTHEST = 1e8
+_NOWHERE = np.empty(0)
 # Room for tiles that are added while the index is in use.
 _ROOMY = ("field.codes", "field.coarse")
 _ROOM_SHARE = 8
@@ -273,8 +274,14 @@ def _check_references(arrays: Mapping[str, NDArray[Any]], count: int) -> None:
         ValueError: One does.
     """
     for name, array in arrays.items():
-        if array.dtype != _TYPES.get(name, array.dtype):
+        if (array.dtype, array.ndim) != _KINDS.get(name, (array.dtype, array.ndim)):
             raise ValueError(f"{name} of the index has values of another kind")
+    for name in _PLACES:
+        array = arrays.get(name, _NOWHERE)
+        if array.size and not -_FARTHEST <= array.min() <= array.max() <= _FARTHEST:
+            raise ValueError(f"{name} of the index has values that are no places")
+    if np.any(np.abs(arrays["anchors.main_angles"]) > _FARTHEST):  # NaN where there is none
+        raise ValueError("anchors.main_angles of the index has values that are no angles")
     sensors = arrays["scans.sensors"]
     lengths = (("scans.starts", "scans.ranges"), ("names.starts", "names.text"))
     if (

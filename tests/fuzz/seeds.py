@@ -10,6 +10,7 @@ import gzip
 import io
 import itertools
 import json
+import math
 import os
 import struct
 import tempfile
@@ -29,6 +30,7 @@ from anchorscan import (
     simulate,
     write_map,
 )
+from anchorscan.array_file import write_arrays
 
 SEPARATOR = b"\n--8<--\n"
 """Between the files of an input that stands for several."""
@@ -214,6 +216,41 @@ def sealed() -> list[bytes]:
         rows.append(SEPARATOR.join([head, b"name", b"", scan.ranges.tobytes()]))
     rows.append(SEPARATOR.join([head, b"", b'{"method": "references"}', scan.ranges.tobytes()]))
     return rows
+
+
+ARRAYS = {"keys": np.arange(9, dtype=np.uint32), "rows": np.ones((3, 5)), "none": np.empty(0)}
+"""What a small file of arrays holds."""
+
+
+def array_files() -> list[bytes]:
+    """Files of arrays, with and without room behind them."""
+    found = []
+    for room in ({}, {"rows": 4}):
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "arrays"
+            write_arrays(path, ARRAYS, "fuzz", room)
+            found.append(path.read_bytes())
+    return found
+
+
+EDIT = struct.Struct("<BBHHq")
+"""One change of the arrays of an index: which, how, where, how many, and a value."""
+
+
+def index_edits() -> list[bytes]:
+    """Changes of the arrays of an index: none, and a value of every kind in every array."""
+    found = [b"\0", b"\1"]
+    for how in range(9):
+        found += [bytes([n & 1]) + EDIT.pack(n, how, 3, 2, -1) for n in range(24)]
+    found += [b"\0" + EDIT.pack(n, 0, 3, 2, WORST[n % len(WORST)]) for n in range(24)]
+    return found
+
+
+WORST = tuple(
+    struct.unpack("<q", struct.pack("<d", value))[0]
+    for value in (math.nan, math.inf, -math.inf, 1e308, 1e18, 1e9)
+)
+"""Numbers that fit no kernel, as the value of a change."""
 
 
 def directories() -> list[bytes]:

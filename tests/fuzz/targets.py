@@ -31,6 +31,7 @@ from anchorscan import (
     Log,
     LogError,
     Matcher,
+    Pose2D,
     Reference,
     ReferenceSet,
     ReferenceSetError,
@@ -42,6 +43,8 @@ from anchorscan import (
     reference_scans,
 )
 from anchorscan.answers import read_runs
+from anchorscan.array_file import read_arrays, write_arrays
+from anchorscan.derived_index import _made_of, index_path
 from anchorscan.set_file import _Header, _seal, _store_header
 
 from . import seeds
@@ -286,6 +289,111 @@ def _sealed(data: bytes, folder: Path) -> None:
         _one_line(error)
 
 
+def _arrays(data: bytes, folder: Path) -> None:
+    """A file of arrays: what is read is what was written, or nothing."""
+    path = folder / "arrays"
+    path.write_bytes(data)
+    read = read_arrays(path, "fuzz")
+    if read is None:
+        return
+    for name, array in seeds.ARRAYS.items():
+        assert read[name].dtype == array.dtype
+        assert read[name][: len(array)].tobytes() == array.tobytes()
+    for array in read.values():
+        array[len(array) :] = 7  # what is nobody's must not be somebody else's
+        array[len(seeds.ARRAYS["rows"]) :] = 7
+    for name, array in seeds.ARRAYS.items():
+        assert name != "rows" or read[name][: len(array)].tobytes() == array.tobytes()
+
+
+_INDEXED = (Settings(), Settings.preset().changed({"database": {"candidates": 1}}))
+
+
+@functools.cache
+def _indexed(kind: int) -> tuple[bytes, dict[str, np.ndarray]]:
+    """A set's file, and the arrays of its index, by one kind of settings."""
+    import tempfile
+
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "a.apr"
+        with ReferenceSet(path=path, settings=_INDEXED[kind]) as places:
+            for scan, pose in seeds.rooms():
+                places.add(scan, pose, "niche")
+            places.save_index()
+        found = read_arrays(index_path(path), _made_of(_INDEXED[kind]))
+        assert found is not None
+        used = {name: len(found["field.squares"]) + 1 for name in ("field.codes", "field.coarse")}
+        cut = {name: array[: used.get(name)].copy() for name, array in found.items()}
+        return path.read_bytes(), cut
+
+
+def _edited(arrays: dict[str, np.ndarray], edit: bytes) -> None:
+    """Change arrays as somebody would who knows what they are and means harm."""
+    which, how, place, count, value = seeds.EDIT.unpack(edit.ljust(seeds.EDIT.size, b"\0"))
+    name = sorted(arrays)[which % len(arrays)]
+    array = arrays[name]
+    size = array.dtype.itemsize
+    own = np.frombuffer(struct.pack("<q", value)[:size], array.dtype)[0]
+    if array.dtype == np.float32:
+        with np.errstate(over="ignore"):
+            own = np.float32(struct.unpack("<d", struct.pack("<q", value))[0])
+    flat = array.reshape(-1)
+    at = place % max(len(flat), 1)
+    ways = ("set", "fill", "shift", "cut", "repeat", "retype", "remove", "reshape", "reverse")
+    match ways[how % len(ways)]:
+        case "set":
+            flat[at : at + 1] = own
+        case "fill":
+            flat[at : at + count] = own
+        case "shift":
+            with np.errstate(all="ignore"):
+                flat[at : at + count] += own
+        case "cut":
+            arrays[name] = array[: place % (len(array) + 1)].copy()
+        case "repeat":
+            arrays[name] = np.concatenate([array, array[: count % 64]])
+        case "retype":
+            kinds = "bBhHiIqQfd"
+            with np.errstate(all="ignore"):
+                arrays[name] = array.astype(kinds[value % len(kinds)])
+        case "remove":
+            del arrays[name]
+        case "reshape":
+            arrays[name] = flat[:, np.newaxis] if value % 2 else flat.copy()
+        case "reverse":
+            flat[at : at + count] = flat[at : at + count][::-1].copy()
+
+
+def _index(data: bytes, folder: Path) -> None:
+    """An index that was crafted with care: every checksum is right, the numbers are not.
+
+    It must be left alone, or serve: whatever happens to the set then, it holds.
+    """
+    kind = data[:1] > b"\x7f" or data[:1] == b"\1"
+    content, sound = _indexed(int(kind))
+    arrays = {name: array.copy() for name, array in sound.items()}
+    for at in range(1, len(data), seeds.EDIT.size):
+        if arrays:
+            _edited(arrays, data[at : at + seeds.EDIT.size])
+    path = folder / "indexed.apr"
+    path.write_bytes(content)
+    room = dict.fromkeys(("field.codes", "field.coarse"), 8)
+    write_arrays(index_path(path), arrays, _made_of(_INDEXED[kind]), room)
+    asked = _rooms()[0].scan
+    try:
+        with ReferenceSet.open(path) as places:
+            for candidates in (None, 1):
+                for hypothesis in places.locate(asked, candidates):
+                    _check_hypothesis(hypothesis)
+            _check_set(places)
+            places.add(asked, Pose2D(20.0, 3.0, 1.0))
+            places.remove(0)
+            for hypothesis in places.locate(asked):
+                _check_hypothesis(hypothesis)
+    except AnchorscanError as error:
+        _one_line(error)
+
+
 def _directory(data: bytes, folder: Path) -> None:
     description, table, ranges = (*data.split(seeds.SEPARATOR, 2), b"", b"")[:3]
     home = folder / "exported"
@@ -447,6 +555,8 @@ TARGETS = {
         Target(
             "set-directory", seeds.directories, _directory, (seeds.SEPARATOR, *_JSON, *_NUMBERS)
         ),
+        Target("arrays", seeds.array_files, _arrays, (b'"shape"', b'"rows"', b"[", *_NUMBERS)),
+        Target("index", seeds.index_edits, _index, (b"\xff" * 8, *_DOUBLES)),
         Target("map", seeds.maps, _map, (seeds.SEPARATOR, *_YAML, *_MAP, *_NUMBERS)),
         Target("map-scans", seeds.maps, _map_scans, (seeds.SEPARATOR, *_MAP, *_NUMBERS)),
         Target("settings", seeds.settings, _settings, _JSON),
