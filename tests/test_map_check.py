@@ -6,6 +6,7 @@ import json
 import math
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,12 +19,14 @@ from anchorscan import (
     ReferenceSet,
     SensorModel,
     drive,
+    load_map,
     random_building,
     stitch,
     write_map,
 )
 from anchorscan.cli import main
 from anchorscan.map_check import check, draw, rigid_track, table
+from anchorscan.plausibility import ScaleCheck, scale_check
 from anchorscan.simulator import move_furniture, noisy_odometry, random_poses, turn_doors
 
 Run = Callable[..., tuple[int, str, str]]
@@ -215,3 +218,36 @@ def test_a_scan_elsewhere_is_not_located_in_a_map(office: tuple[Path, list[Recor
     outcome = check(load_map(office[0]), elsewhere)
     assert outcome.accepted.mean() <= 0.1
     assert isinstance(outcome.located[0].scan, LaserScan)
+
+
+@pytest.mark.parametrize("scale", [0.8, 1.07])
+def test_a_map_of_the_wrong_scale_is_named(
+    office: tuple[Path, list[Record]], tmp_path: Path, scale: float
+) -> None:
+    """The resolution in its YAML is not that of the cells: nothing else tells."""
+    grid = load_map(office[0])
+    write_map(replace(grid, resolution=scale * grid.resolution), tmp_path / "other.yaml")
+    found = check(load_map(tmp_path / "other.yaml"), office[1][::3]).scale
+    assert found.is_scaled
+    assert found.scale == pytest.approx(scale, abs=0.02)
+
+
+def test_the_scale_is_said_where_it_is_wrong_and_only_there(
+    office: tuple[Path, list[Record]],
+) -> None:
+    right = check(load_map(office[0]), office[1][::3])
+    assert not any(line.startswith("scale:") for line in table(right))
+    told = replace(right, scale=ScaleCheck(24, 1, 1.2, 20))
+    (line,) = [line for line in table(told) if line.startswith("scale:")]
+    assert "20 % too large" in line
+    assert "is its resolution 0.0417 m, not 0.05 m?" in line
+
+
+def test_a_drive_elsewhere_is_of_no_other_scale(office: tuple[Path, list[Record]]) -> None:
+    """Each of many scales gives wrong answers a chance."""
+    lidar = SensorModel(2.0 * math.pi, math.radians(1.0), range_max=12.0, noise=0.015)
+    places = ReferenceSet.build(office[1], keep_all=True)
+    elsewhere = drive(random_building(31, length=30.0, depth=18.0), lidar, length=40.0, step=1.5)
+    found = scale_check(places, [each.scan for each in elsewhere if each.scan is not None])
+    assert found.asked >= 20
+    assert not found.is_scaled

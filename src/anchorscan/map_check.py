@@ -7,6 +7,9 @@ answers.  Wrong answers do not move as the odometry does, unless all are wrong t
 a mirrored or repeated building: that is for the eye, hence the picture.  Odometry drifts, so
 this is a check for a drive of some tens of metres.
 
+Where few scans are located they are tried longer and shorter: a map whose ``resolution`` is not
+that of its cells is silent, and says so then.
+
 Where the map has changed since it was made, readings end in its free space and rays pass
 through its surfaces; both shares are told for the scans on the track.
 """
@@ -29,6 +32,7 @@ from .hypothesis import Hypothesis
 from .io import Log
 from .map_file import load_map
 from .occupancy import MAP_SENSOR, OccupancyGrid, reference_scans
+from .plausibility import ScaleCheck, scale_check
 from .pose import Pose2D
 from .progress import ProgressOf
 from .record import Record
@@ -83,12 +87,14 @@ class MapCheck:
         places: Its references.
         building: Processor time from the map's cells to the finished set, seconds.
         located: Every usable scan of the drive.
+        scale: Whether map and scans are of one scale.
     """
 
     grid: OccupancyGrid
     places: ReferenceSet
     building: float
     located: tuple[Located, ...]
+    scale: ScaleCheck
 
     @cached_property
     def track(self) -> tuple[Pose2D | None, NDArray[np.bool_]]:
@@ -186,7 +192,8 @@ def check(
     )
     if not located:
         raise LogError("the recording has no usable scan")
-    return MapCheck(grid, places, building, located)
+    scale = scale_check(places, (each.scan for each in located))
+    return MapCheck(grid, places, building, located, scale)
 
 
 def rigid_track(
@@ -238,6 +245,7 @@ def table(outcome: MapCheck) -> list[str]:
         f"scans:     {count}, a query takes {np.median(milliseconds):.1f} ms of processor time "
         f"(median; 99 of 100 at most {np.percentile(milliseconds, 99):.1f} ms)",
         f"located:   {accepted}, not known {count - accepted}",
+        *_of_scale(outcome.scale, grid.resolution),
     ]
     if not outcome.has_odometry.any():
         return [*lines, "track:     no odometry to check the answers with"]
@@ -252,6 +260,19 @@ def table(outcome: MapCheck) -> list[str]:
         f"{empty:.0f} % in its free space; {through:.0f} % of the rays pass through surfaces"
     )
     return lines
+
+
+def _of_scale(scale: ScaleCheck, resolution: float) -> list[str]:
+    """Say by how much the map is too large or too small, if it is."""
+    if not scale.is_scaled:
+        return []
+    off = 100.0 * abs(scale.scale - 1.0)
+    size = "large" if scale.scale > 1.0 else "small"
+    return [
+        f"scale:     the map looks {off:.0f} % too {size}: of {scale.asked} scans {scale.scaled} "
+        f"are located with readings {scale.scale:.2f} times as long, {scale.as_given} as they are; "
+        f"is its resolution {resolution / scale.scale:.3g} m, not {resolution:g} m?"
+    ]
 
 
 def draw(outcome: MapCheck) -> Figure:

@@ -9,10 +9,13 @@ A reader takes what is written.  Here a whole recording is looked at for what no
   mounted, and the length of its mean direction is 0.53 to 0.98 on the logs that this was tried
   with, but 0.02 to 0.30 on the same with their headings in degrees;
 * times that repeat or run backwards;
-* scans that fit the map only as their mirror image: a laser that hangs upside down.
+* scans that fit the map only as their mirror image: a laser that hangs upside down;
+* scans that fit the map only when all their readings are so many times as long: a map of another
+  scale.
 
-All but the last need nothing but the recording.  One scan cannot tell the last: a room on the left
-of a corridor is the mirror image of one on the right.  Several scans can.
+All but the last two need nothing but the recording.  One scan cannot tell these: a room on the left
+of a corridor is the mirror image of one on the right, and a small office has the shape of a large
+one.  Several scans can.
 """
 
 from __future__ import annotations
@@ -29,7 +32,15 @@ from .pose import Pose2D
 from .record import Record
 from .scan import LaserScan
 
-__all__ = ["MirrorCheck", "Plausibility", "mirror_check", "mirror_image"]
+__all__ = [
+    "MirrorCheck",
+    "Plausibility",
+    "ScaleCheck",
+    "mirror_check",
+    "mirror_image",
+    "scale_check",
+    "scaled_scan",
+]
 
 _FEWEST = 5
 _MOST_STEPS = 10_000
@@ -41,6 +52,12 @@ _FEWEST_STEPS, _LEAST_CONSTANT = 30, 0.4
 # Scans that are asked both ways, of so many at the beginning.
 _LOOKED_AT, _ASKED = 400, 24
 _MIRRORED_SHARE = 0.7
+# A third of the scans: more do not fit a map of the wrong scale as they are, fewer do not tell one.
+_THIRD = 1.0 / 3.0
+# Scales that are tried; a scan fits at a scale within two or three hundredths of it.
+_LARGEST_SCALE, _SCALE_STEP, _FINE_STEP = 2.2, 0.02, 0.005
+# Other scales are tried with every so many-th of the scans first.
+_SOME = 2
 
 
 class Plausibility:
@@ -170,6 +187,67 @@ def mirror_check(places: _Places, records: Iterable[Record]) -> MirrorCheck:
         as_given += better.accepted and not is_mirrored
         mirrored += better.accepted and is_mirrored
     return MirrorCheck(as_given, mirrored)
+
+
+@dataclass(frozen=True)
+class ScaleCheck:
+    """How many scans fit as they are, and how many when they are made longer or shorter.
+
+    Args:
+        asked: Scans that were asked.
+        as_given: Those of them that are located as they are.
+        scale: By how much all readings must be longer for most of them to fit; 1 where so many
+            fit as they are that nothing else was tried.
+        scaled: Scans that are located then.
+    """
+
+    asked: int
+    as_given: int
+    scale: float
+    scaled: int
+
+    @property
+    def is_scaled(self) -> bool:
+        """Whether map and scans are of different scales, beyond reasonable doubt."""
+        return (
+            self.scale != 1.0
+            and self.scaled >= max(_FEWEST, _THIRD * self.asked)
+            and self.as_given <= _THIRD * self.scaled
+        )
+
+
+def scale_check(places: _Places, scans: Iterable[LaserScan]) -> ScaleCheck:
+    """Locate some scans of the beginning of a recording; when few are found, also at other scales.
+
+    Scales from 0.45 to 2.2 are tried; that takes about a thousand queries.
+
+    Args:
+        places: Where they are sought.
+        scans: Of the recording, from its beginning.
+    """
+    scans = list(islice(scans, _LOOKED_AT))
+    scans = scans[:: max(1, len(scans) // _ASKED)]
+    as_given, _ = _fitting(places, scans, 1.0)
+    if len(scans) < _FEWEST or as_given > _THIRD * len(scans):
+        return ScaleCheck(len(scans), as_given, 1.0, as_given)
+    steps = int(math.log(_LARGEST_SCALE) / _SCALE_STEP)
+    coarse = [math.exp(_SCALE_STEP * step) for step in range(-steps, steps + 1)]
+    scale = max(coarse, key=lambda each: _fitting(places, scans[::_SOME], each))
+    fine = [scale * math.exp(_FINE_STEP * step) for step in range(-4, 5)]
+    scale = max(fine, key=lambda each: _fitting(places, scans[::_SOME], each)[1])
+    return ScaleCheck(len(scans), as_given, scale, _fitting(places, scans, scale)[0])
+
+
+def _fitting(places: _Places, scans: Iterable[LaserScan], scale: float) -> tuple[int, float]:
+    """Count the scans that are located at a scale, and add the scores of all."""
+    best = [each for scan in scans for each in places.locate(scaled_scan(scan, scale))[:1]]
+    return sum(each.accepted for each in best), sum(each.score for each in best)
+
+
+def scaled_scan(scan: LaserScan, scale: float) -> LaserScan:
+    """Return what the same laser would see in a building so many times as large."""
+    geometry = (scan.angle_min, scan.angle_increment, scale * scan.range_min)
+    return LaserScan(scale * scan.ranges, *geometry, scale * scan.range_max)
 
 
 def mirror_image(scan: LaserScan) -> LaserScan:
