@@ -7,13 +7,19 @@ BIN := $(VENV)/bin
 PYTEST_ARGS ?=
 # Files of tests share the cores, in the order of tests/conftest.py; PYTEST_SHARE= runs them one after the other.
 PYTEST_SHARE ?= --numprocesses auto --dist loadfile --no-loadscope-reorder
+PYTHONS ?= python3.10 python3.12 python3.13
+# The stages, the readers, the files and the command line.
+VERSION_TESTS := $(patsubst %,tests/test_%.py,scan angle_function segments anchors graph database alignment \
+	evaluation field proposal verification decision matcher settings io_carmen io_damage io_g2o io_recorded \
+	io_rosbag io_tables io_tum array_file derived_index reference_set reference_set_file map_file bad_input \
+	localizer repetition cli)
 FUZZ_TARGETS ?=
 FUZZ_RUNS ?= 1000000
 FUZZ_SECONDS ?= 3600
 
 .DEFAULT_GOAL := help
 .PHONY: help setup check test ros-test bench docs release demo picture lock clean
-.PHONY: fuzz test-lowest test-newest audit package
+.PHONY: fuzz test-lowest test-newest test-versions audit package
 
 help: ## show this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-11s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -72,6 +78,16 @@ define test_with
 	$(2)/bin/python -m pytest $(PYTEST_ARGS)
 endef
 
+test-versions: setup ## answers and tests under other Pythons: PYTHONS="python3.10 python3.13"
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check uv
+	for python in $(PYTHONS); do \
+		$$python -m venv --clear --without-pip $(VENV)-$$(basename $$python) || exit 1; \
+		$(BIN)/uv pip install --quiet --python $(VENV)-$$(basename $$python)/bin/python \
+			--constraint requirements-dev.txt -e ".[bags,maps,plot]" "rtb-data>=1.0" pytest hypothesis || exit 1; \
+		$(VENV)-$$(basename $$python)/bin/python -m pytest $(VERSION_TESTS) $(PYTEST_ARGS) || exit 1; \
+	done
+	$(BIN)/anchorscan endure repeat $(foreach python,$(PYTHONS),--python $(VENV)-$(notdir $(python))/bin/python)
+
 audit: setup ## look the pinned versions up among the known weaknesses; needs pypi.org
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check pip-audit
 	$(BIN)/pip-audit --strict --disable-pip --require-hashes -r requirements-dev.txt
@@ -119,4 +135,4 @@ lock: setup ## resolve the pinned requirements anew, for Python 3.10 and later
 		pyproject.toml requirements-ros.in --output-file requirements-ros.txt
 
 clean: ## remove what the verbs made
-	rm -rf $(VENV) $(VENV)-release $(VENV)-ros $(VENV)-lowest $(VENV)-newest $(VENV)-package site dist build .mypy_cache .ruff_cache .pytest_cache
+	rm -rf $(VENV) $(VENV)-release $(VENV)-ros $(VENV)-lowest $(VENV)-newest $(VENV)-package $(VENV)-python* site dist build .mypy_cache .ruff_cache .pytest_cache

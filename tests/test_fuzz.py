@@ -45,7 +45,7 @@ def test_a_target_that_hangs_or_hoards_is_caught(tmp_path: Path) -> None:
         sum(range(10**8 if data else 0))
 
     def hoard(data: bytes, folder: Path) -> None:
-        bytes(b"\1" * (3 << 30 if data else 0))
+        bytes(b"\1" * (3 << 29 if data else 0))
 
     with pytest.raises(SlowError):
         execute(Target("hang", list, hang), b"a", tmp_path)
