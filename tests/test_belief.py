@@ -146,7 +146,8 @@ def test_new_places_are_those_that_no_known_one_is_and_come_from_the_heaviest_wi
     rng = np.random.default_rng(seed)
     known, found = some_poses(rng, 6, 1.5), some_poses(rng, 9, 1.5)
     spread, weights = some_covariances(rng, 6), rng.normal(size=6)
-    new, parents = _new(known, spread, weights, found, (0.5, 0.5), 2.0)
+    spread_found = 0.1 * some_covariances(rng, 9)
+    new, parents = _new((known, spread, weights), (found, spread_found), (0.5, 0.5), 2.0)
     wanted = []
     for n, pose in enumerate(found):
         if any(are_one(pose, each, 0.5, 0.5) for each in known):
@@ -155,7 +156,7 @@ def test_new_places_are_those_that_no_known_one_is_and_come_from_the_heaviest_wi
         for k, each in enumerate(known):
             off = pose - each
             off[2] = math.remainder(off[2], 2.0 * math.pi)
-            if off @ np.linalg.solve(spread[k], off) < 4.0:
+            if off @ np.linalg.solve(spread[k] + spread_found[n], off) < 4.0:
                 near.append(k)
         wanted.append((n, max(near, key=lambda k: weights[k], default=-1)))
     assert list(zip(new.tolist(), parents.tolist(), strict=True)) == wanted

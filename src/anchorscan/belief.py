@@ -85,6 +85,7 @@ _SCORE, _CLOSE, _FREE, _UNKNOWN, _THROUGH = (
 )
 _SMALLEST_SHARE = 0.05
 _LEAST_PROBABILITY = 1e-4
+_REFOUND = 1.0 / 3.0
 _NEVER = -1e3  # logarithm of a weight that is none, finite so that differences are
 
 
@@ -281,16 +282,19 @@ def admitted(
         The mixture, new places last and without weight; (K,) index of the place that each
         comes from: its own if it was known, -1 if it comes from what was unsearched.
     """
-    same = (settings.same_distance, settings.same_turn)
-    new, parents = _new(
-        mixture.poses, mixture.covariances, mixture.weights, found.poses, same, settings.reach
-    )
-    count = len(new)
     # Nearly all accepted answers are within half a metre: three of these deviations.
-    position = np.full(count, settings.found_deviation)
-    position[(new == 0) & found.accepted] = settings.answer_deviation
-    deviations = np.column_stack([position, position, np.full(count, settings.found_turn)])
-    spread = np.square(deviations)[:, :, None] * np.eye(3)
+    position = np.full(len(found.poses), settings.found_deviation)
+    position[: int(found.accepted)] = settings.answer_deviation
+    turn = np.full(len(position), settings.found_turn)
+    spread = np.square(np.column_stack([position, position, turn]))[:, :, None] * np.eye(3)
+    same = (_REFOUND * settings.same_distance, _REFOUND * settings.same_turn)
+    new, parents = _new(
+        (mixture.poses, mixture.covariances, mixture.weights),
+        (found.poses, spread),
+        same,
+        settings.reach,
+    )
+    count, spread = len(new), spread[new]
     origin = np.concatenate([np.arange(len(mixture)), parents])
     return replace(
         mixture,
@@ -362,15 +366,18 @@ def weighed(
         settings: Of the belief.
         claim: The answer of a search for this scan, where there was one.
     """
-    odds, answered, count = log_odds(fits, settings), mixture.answered, len(mixture)
+    plain, answered, count = log_odds(fits, settings), mixture.answered, len(mixture)
     if claim is not None:
         answered = np.zeros(count)
-        answered[claim.place] = max(claim.odds - odds[claim.place], 0.0)
-    odds = odds + answered
+        answered[claim.place] = max(claim.odds - plain[claim.place], 0.0)
+    odds = plain + answered
     weights = mixture.weights.copy()
     known = origin == np.arange(count)
     inherits = ~known & (origin >= 0)
-    weights[inherits] = weights[origin[inherits]] + _log(settings.mistaken)
+    children = np.bincount(origin[inherits], minlength=count)
+    weights[inherits] = (weights - np.log(np.maximum(children, 1)))[origin[inherits]]
+    weights[inherits] += _log(settings.mistaken)
+    weights[children > 0] += math.log1p(-settings.mistaken)
     weights[known | inherits] += share * odds[known | inherits]
     unsearched, nowhere = mixture.unsearched, mixture.nowhere
     found = origin < 0
@@ -384,7 +391,7 @@ def weighed(
         nowhere = _log_sum(np.array([nowhere, unsearched - total]))
         unsearched = _NEVER
     new = np.where(known, min(settings.news * share, 1.0), 1.0)
-    new = new / (1.0 + np.exp(-odds))
+    new = new / (1.0 + np.exp(-plain))
     information = _certain(fits.hessians, settings.spurious)
     information *= (new / settings.reading_deviation**2)[:, None, None]
     covariances = _inverses(_inverses(mixture.covariances) + information)
@@ -546,20 +553,21 @@ def _owners(poses, distance, turn):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _new(known, covariances, weights, found, same, reach):  # type: ignore[no-untyped-def]
+def _new(known, found, same, reach):  # type: ignore[no-untyped-def]
     """Which found poses are new, and the heaviest place within reach of each, or -1."""
-    information = _inverses(covariances)
-    new = np.empty(len(found), np.int64)
-    parents = np.empty(len(found), np.int64)
+    poses, covariances, weights = known
+    new = np.empty(len(found[0]), np.int64)
+    parents = np.empty(len(found[0]), np.int64)
     count = 0
-    for n in range(len(found)):
+    for n in range(len(found[0])):
         is_new, parent, best = True, -1, -np.inf
-        for k in range(len(known)):
-            if _is_same(found[n], known[k], same):
+        information = _inverses(covariances + found[1][n])
+        for k in range(len(poses)):
+            if _is_same(found[0][n], poses[k], same):
                 is_new = False
                 break
-            x, y = found[n, 0] - known[k, 0], found[n, 1] - known[k, 1]
-            t = wrapped(found[n, 2] - known[k, 2])
+            x, y = found[0][n, 0] - poses[k, 0], found[0][n, 1] - poses[k, 1]
+            t = wrapped(found[0][n, 2] - poses[k, 2])
             i = information[k]
             off = x * x * i[0, 0] + y * y * i[1, 1] + t * t * i[2, 2]
             off += 2.0 * (x * y * i[0, 1] + x * t * i[0, 2] + y * t * i[1, 2])
