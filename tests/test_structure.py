@@ -50,6 +50,7 @@ VALUES = {"errors", "pose", "scan", "record", "reference"}
 LEAVES = {
     *(
         "ablation",
+        "answer_odds",
         "benchmark",
         "calibration",
         "changed_world",

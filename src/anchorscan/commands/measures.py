@@ -30,6 +30,7 @@ from .options import (
 if TYPE_CHECKING:
     from ..benchmark import Task
     from ..record import Record
+    from ..settings import Settings
 
 __all__ = [
     "ablate",
@@ -275,14 +276,23 @@ def calibrate(
     queries: Annotated[
         int, typer.Option(min=1, metavar="N", help="At most so many queries of each split.")
     ] = 200,
+    belief: Annotated[
+        bool,
+        typer.Option(
+            "--belief", help="What an answer tells the belief on the move; after the decision."
+        ),
+    ] = False,
 ) -> None:
     """Fit what an answer's evidence is worth, each building scored by the others.
 
-    Prints the coefficients for the settings file's section "decision".
+    Prints the coefficients for the settings file's section "decision", or "belief".
     """
     from .. import calibration
 
     chosen = settings.chosen()
+    if belief:
+        _calibrate_belief(logs, chosen, queries)
+        return
     cases = _tasks(logs)
     samples = calibration.gather(cases, chosen, queries, say)
     typer.echo("scored by the fit to the other buildings:")
@@ -302,6 +312,23 @@ def calibrate(
             f"{sum(fit.accepted for fit in pairs)} of {sum(fit.queries for fit in pairs)} answered"
         )
     typer.echo(json.dumps({"decision": calibration.weigh(samples)}, indent=2))
+
+
+def _calibrate_belief(logs: list[str] | None, chosen: Settings, queries: int) -> None:
+    from .. import answer_odds
+
+    cases = _tasks(logs, "P1", "P3", "P4")
+    drives = {case.asked.name: case.asked for case in cases if case.protocol != "P4"}
+    samples = answer_odds.gather(cases, drives.values(), chosen, queries, say)
+    for fit in (answer_odds.fit(samples), *answer_odds.rotate(samples)):
+        typer.echo(
+            f"{f'without {fit.without}' if fit.without else 'all'}: {fit.constant:.2f} + "
+            f"{fit.weight:.2f} * log odds; above 20 to 1: {fit.right:.3f} of the right answers, "
+            f"{fit.elsewhere:.3f} in other buildings, {fit.unmapped:.3f} where the map has ended"
+        )
+    whole = answer_odds.fit(samples)
+    found = {"answer_constant": whole.constant, "answer_weight": whole.weight}
+    typer.echo(json.dumps({"belief": found}, indent=2))
 
 
 def ablate(
