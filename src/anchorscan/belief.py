@@ -35,11 +35,13 @@ the way driven.  And an answer speaks, by a, for all that had not been searched 
 new or one that was given up: this is how a robot that was carried away is found again.
 
 Weights compare places with each other; whether the best of them is any good is another matter.
-A pose that slips off while the robot drives where little is known, or one carried on in a place
+A pose that slips off along a corridor or where little is known, or one carried on in a place
 that looks alike, has no rival yet.  So every place keeps its *record*, the mean of u over the
 latest way, and only a place is reported whose record is not bad, neither by itself nor beside
 that of another place.  For the same reason a scan holds a pose only as much as it fits there:
-its information counts with the probability that u stands for.  And walls are never quite
+its information counts with the probability that u stands for, by itself and not by an answer,
+and with the share of its readings that the map explains, since the few that happen to lie near
+a surface where the map ends turn a pose without telling it.  And walls are never quite
 straight: along a plain corridor they seem to hold the pose by a small share of what they do
 across it, and scan after scan would make certain what none of them can tell.  So that share of
 the information of the best direction is taken off in every direction.
@@ -391,7 +393,7 @@ def weighed(
         nowhere = _log_sum(np.array([nowhere, unsearched - total]))
         unsearched = _NEVER
     new = np.where(known, min(settings.news * share, 1.0), 1.0)
-    new = new / (1.0 + np.exp(-plain))
+    new *= np.clip(fits.features[:, _SCORE], 0.0, 1.0) / (1.0 + np.exp(-plain))
     information = _certain(fits.hessians, settings.spurious)
     information *= (new / settings.reading_deviation**2)[:, None, None]
     covariances = _inverses(_inverses(mixture.covariances) + information)

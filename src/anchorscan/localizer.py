@@ -220,11 +220,13 @@ class Localizer:
         mixture, settings = self._mixture, self._settings
         worth = probabilities(mixture, settings)
         order = np.argsort(-worth, kind="stable")[:_NAMED]
+        right = worth[order] * [held(mixture.covariances[k]) for k in order]
+        best = np.argsort(-right, kind="stable")
+        order, right = order[best], right[best]
         references, T_reference_laser = self._places.nearest(mixture.poses[order])
-        within = [held(mixture.covariances[k]) for k in order]
         accepted = (
             bool(len(order))
-            and bool(worth[order[0]] * within[0] >= settings.threshold)
+            and bool(right[0] >= settings.threshold)
             and has_stood(mixture, int(order[0]), settings)
         )
         hypotheses = tuple(
@@ -236,7 +238,7 @@ class Localizer:
                 evaluation=math.nan,
                 quality=math.nan,
                 score=float(mixture.support[k]),
-                probability=float(worth[k] * within[n]),
+                probability=float(right[n]),
                 accepted=accepted and n == 0,
             )
             for n, k in enumerate(order)
