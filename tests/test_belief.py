@@ -35,6 +35,7 @@ from anchorscan.motion import motion
 from anchorscan.verification import FEATURES, Fits
 
 SETTINGS = BeliefSettings()
+PLACED = ("poses", "covariances", "weights", "support", "record", "answered")
 seeds = st.integers(0, 2**32 - 1)
 
 
@@ -392,3 +393,80 @@ def test_only_an_accepted_answer_tells_the_position_more_closely():
     assert np.sqrt(spreads[0][0, 0, 0]) == pytest.approx(SETTINGS.found_deviation)
     assert np.sqrt(spreads[1][0, 0, 0]) == pytest.approx(SETTINGS.answer_deviation)
     assert np.array_equal(spreads[0][1], spreads[1][1])
+
+
+# Poses that slipped
+
+
+def slipped(ahead, scores, **found):
+    """A located robot whose place is ``ahead`` of where a search finds it; after that scan."""
+    rng = np.random.default_rng(0)
+    shares = {"close": 1.0, "unknown": 0.0, "through": 0.0}
+    known, origin = admitted(nothing_known(), Found(np.array([[ahead, 0.0, 0.0]])), SETTINGS)
+    fits = some_fits(rng, known.poses, score=0.97, **shares)
+    known = tidied(weighed(known, fits, origin, 1.0, SETTINGS), SETTINGS)
+    known = replace(known, covariances=0.07**2 * np.eye(3)[None], unsearched=-9.0, nowhere=-9.0)
+    found = Found(np.zeros((1, 3)), **found)
+    mixture, origin = admitted(known, found, SETTINGS)
+    fits = some_fits(rng, mixture.poses, score=scores[: len(mixture)], **shares)
+    claim = claimed(mixture, found, SETTINGS)
+    return tidied(weighed(mixture, fits, origin, 0.25, SETTINGS, claim), SETTINGS)
+
+
+def test_a_search_corrects_the_pose_of_a_place_where_the_scan_speaks_for_it():
+    after = slipped(0.2, [0.72, 0.97])
+    assert after.poses[0, 0] == 0.0
+    assert len(after) == 1
+    assert slipped(0.2, [0.95, 0.96]).poses[0, 0] == 0.2
+
+
+def test_a_sure_answer_is_no_witness_of_the_pose_that_it_contradicts():
+    after = slipped(0.2, [0.72, 0.97], probability=0.999, accepted=True)
+    assert after.poses[0, 0] == 0.0
+
+
+def test_a_slip_further_than_a_place_is_followed_as_a_rival_and_silences_both():
+    after = slipped(0.6, [0.93, 0.95])
+    assert len(after) == 2
+    worth = np.sort(probabilities(after, SETTINGS))
+    assert worth[0] > 0.05
+    assert worth[1] < SETTINGS.threshold
+
+
+def test_all_but_the_same_pose_needs_no_second_look():
+    known, _ = admitted(nothing_known(), Found(np.zeros((1, 3))), SETTINGS)
+    again, origin = admitted(known, Found(np.array([[0.05, 0.0, 0.01]])), SETTINGS)
+    assert len(again) == 1
+    assert origin.tolist() == [0]
+
+
+@given(seed=seeds)
+def test_what_a_place_hands_on_is_taken_off_it(seed):
+    """Scans that say nothing leave the probability of all places together as it was."""
+    rng = np.random.default_rng(seed)
+    known = some_mixture(rng, 5)
+    near = known.poses[rng.integers(0, len(known), 4)] + rng.normal(0.0, 0.2, (4, 3))
+    mixture, origin = admitted(known, Found(near), SETTINGS)
+    keep = np.flatnonzero(origin >= 0)
+    mixture = replace(
+        mixture,
+        **{name: getattr(mixture, name)[keep] for name in PLACED},
+        unsearched=known.unsearched,
+    )
+    fits = some_fits(rng, mixture.poses)
+    after = weighed(mixture, fits, origin[keep], 0.0, SETTINGS)
+    assert np.exp(after.weights).sum() == pytest.approx(np.exp(known.weights).sum())
+
+
+def test_a_pose_is_held_by_what_the_map_explains_and_not_by_an_answer():
+    rng = np.random.default_rng(0)
+    mixture, _ = admitted(nothing_known(), Found(np.zeros((1, 3))), SETTINGS)
+    spreads = []
+    for unknown, claim in ((0.0, None), (0.6, None), (0.6, Claim(0, 6.0))):
+        score = 0.97 * (1.0 - unknown)
+        fits = some_fits(rng, mixture.poses, score=score, close=1.0, unknown=unknown, through=0.0)
+        fits = replace(fits, hessians=30.0 * np.eye(3)[None])
+        after = weighed(mixture, fits, np.arange(1), 0.2, SETTINGS, claim)
+        spreads.append(np.trace(after.covariances[0]))
+    assert spreads[0] < 0.8 * spreads[1]
+    assert spreads[1] == spreads[2]

@@ -34,6 +34,12 @@ of the two, and keeps what a is above u for a short way, over which it fades.  L
 the way driven.  And an answer speaks, by a, for all that had not been searched before, be its place
 new or one that was given up: this is how a robot that was carried away is found again.
 
+A search also says when the pose of a known place has slipped: what it finds within reach of a
+place, by the covariances of both, is either another place or where this one is truly.  So it
+starts with a share of its weight, taken off it.  Poses that stay one place are joined at once,
+and the one that the scan speaks for is kept; further off, both are followed, and nothing is
+reported until the way has told which it is.
+
 Weights compare places with each other; whether the best of them is any good is another matter.
 A pose that slips off along a corridor or where little is known, or one carried on in a place
 that looks alike, has no rival yet.  So every place keeps its *record*, the mean of u over the
@@ -87,6 +93,7 @@ _SCORE, _CLOSE, _FREE, _UNKNOWN, _THROUGH = (
 )
 _SMALLEST_SHARE = 0.05
 _LEAST_PROBABILITY = 1e-4
+# Of the limits of one place: nearer poses are the same fit, and need no second look.
 _REFOUND = 1.0 / 3.0
 _NEVER = -1e3  # logarithm of a weight that is none, finite so that differences are
 
@@ -278,7 +285,8 @@ def admitted(
     """Take in the places that a search of the map found, where they are new.
 
     A place within reach of one that was known may be that one, mistaken (along a corridor, or
-    after a step without odometry), and inherits from it.  What earlier answers added is forgotten.
+    after a step without odometry), and inherits from it; so does another pose of the same
+    place, but not one that is all but equal.  What earlier answers added is forgotten.
 
     Returns:
         The mixture, new places last and without weight; (K,) index of the place that each
