@@ -20,6 +20,7 @@ from anchorscan import (
     drive,
     random_building,
 )
+from anchorscan.hypothesis import Hypothesis
 from anchorscan.localizer import Belief
 from anchorscan.protocol import CORRECT_HEADING, CORRECT_POSITION, choose_references
 
@@ -200,6 +201,34 @@ def test_a_step_costs_at_most_one_search_and_a_bounded_number_of_places(
         assert len(belief.hypotheses) <= 5
     assert counting.most <= limits.belief.places + limits.verification.fits
     assert counting.searches < len(journey)
+
+
+def test_a_robot_outside_of_the_map_searches_ever_less(places: Matcher) -> None:
+    """It sees a corridor without an end that is no place of the map."""
+    counting = Counting(places)
+    localizer = Localizer(counting)
+    angles = np.radians(np.arange(-90.0, 91.0))
+    sides = np.minimum(0.31 / np.maximum(np.abs(np.sin(angles)), 1e-9), 30.0)
+    scan = LaserScan(sides, math.radians(-90.0), math.radians(1.0), 0.1, 31.0)
+    searches = []
+    for number in range(400):
+        localizer.update(scan, Pose2D(0.1 * number, 0.0, 0.0))
+        searches.append(counting.searches)
+    assert searches[40] >= 8
+    assert 5 <= searches[399] - searches[200] <= 20
+
+
+def test_a_located_robot_whose_scan_fits_no_more_searches_as_one_that_is_lost(
+    places: Matcher,
+) -> None:
+    settings = places.settings.belief
+    localizer = Localizer(places)
+    spacings = []
+    for score in (3.0, -3.0):
+        best = Hypothesis(0, Pose2D(), Pose2D(), np.eye(3), 0.0, 0.0, score, 0.995, True)
+        localizer._belief = Belief((best,), 0.0, True)
+        spacings.append(localizer._spacing())
+    assert spacings == [settings.check_spacing, settings.search_spacing]
 
 
 # On real logs

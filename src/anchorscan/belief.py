@@ -127,7 +127,7 @@ class BeliefSettings(BaseModel):
     benefit: float = Field(0.5, description="most log odds for a view that may be blocked")
     most_against: float = Field(6.0, gt=0.0, description="log odds that one scan can take")
     most_for: float = Field(4.0, gt=0.0, description="log odds that one scan can give")
-    answer_constant: float = Field(-1.1, description="log odds of an answer that is half sure")
+    answer_constant: float = Field(-2.5, description="log odds of an answer that is half sure")
     answer_weight: float = Field(
         1.4, ge=0.0, description="weight of the log odds of an answer's probability"
     )
@@ -179,7 +179,12 @@ class BeliefSettings(BaseModel):
     search_spacing: float = Field(
         0.5, ge=0.0, description="way between searches of the whole map while lost, metres"
     )
-    check_spacing: float = Field(2.0, ge=0.0, description="the same while located, metres")
+    search_less: float = Field(
+        0.1, ge=0.0, description="share of the way since it was located that the same grows to"
+    )
+    check_spacing: float = Field(
+        2.0, ge=0.0, description="the same while located, and the most, metres"
+    )
     threshold: float = Field(0.99, gt=0.0, lt=1.0, description="probability that is reported")
 
     def readings(self, field: FieldSettings) -> Weights:

@@ -131,6 +131,7 @@ class Localizer:
         self._odometer = Odometer(self._settings.motion)
         self._recent: deque[Record] = deque(maxlen=_KEPT)
         self._since_search = math.inf
+        self._since_located = 0.0
         self._belief = Belief((), 1.0, False)
 
     def prepare(self) -> None:
@@ -178,13 +179,22 @@ class Localizer:
 
     def _is_due(self, step: Motion) -> bool:
         """Whether the whole map is to be searched for this scan."""
-        settings = self._settings
-        spacing = settings.check_spacing if self._belief.accepted else settings.search_spacing
-        self._since_search += step.driven + 0.5 * step.turned
+        way = step.driven + 0.5 * step.turned
+        self._since_located = 0.0 if self._belief.accepted else self._since_located + way
+        self._since_search += way
+        spacing = self._spacing()
         due = self._since_search >= spacing or not len(self._mixture)
         if due:
             self._since_search = 0.0
         return due
+
+    def _spacing(self) -> float:
+        """Way between searches: short while there is doubt, longer again where none has helped."""
+        settings, belief = self._settings, self._belief
+        if belief.accepted and belief.hypotheses[0].score >= settings.least_record:
+            return settings.check_spacing
+        longer = settings.search_less * self._since_located
+        return min(max(settings.search_spacing, longer), settings.check_spacing)
 
     def _remember(self, scan: LaserScan, step: Motion) -> None:
         """Keep the scan for the window if the robot went on a bit; what went before a gap goes."""
