@@ -164,7 +164,7 @@ def _readings(points, runs, way, extent):  # type: ignore[no-untyped-def]
 
 def verify(
     poses: NDArray[np.float64],
-    readings: NDArray[np.float64],
+    seen: NDArray[np.float64],
     tiles: Tiles,
     weights: Weights,
     settings: VerificationSettings,
@@ -173,7 +173,7 @@ def verify(
 
     Args:
         poses: T_set_laser, metres and radians.
-        readings: (N, 3) of the scan, see ``readings``.
+        seen: (N, 3) readings of the scan, see ``readings``.
         tiles: The stitched map.
         weights: What a reading is worth by the byte of its cell.
         settings: Of the sieves.
@@ -186,13 +186,13 @@ def verify(
         settings.distinct_distance,
         settings.distinct_turn,
     )
-    chosen = _sieve(poses, readings, tiles, weights, sieves)
+    chosen = _sieve(poses, seen, tiles, weights, sieves)
     places = (settings.place_distance, settings.place_turn)
     rays = (settings.rays, settings.through_margin)
     steps = (settings.fit_readings, settings.iterations, settings.last_readings)
-    found = _fit(chosen, readings, tiles, weights, steps, places, rays)
+    found = _fit(chosen, seen, tiles, weights, steps, places, rays)
     poses, features, hessians, residuals = found
-    count = min(len(readings), settings.last_readings)
+    count = min(len(seen), settings.last_readings)
     return Fits(poses, features, hessians, residuals, count)
 
 
