@@ -22,6 +22,7 @@ from anchorscan import (
     drive,
     random_building,
 )
+from anchorscan.description import describe
 from anchorscan.fleet import decide_over, search
 from anchorscan.fleet_benchmark import Asked, fitted, outcomes
 
@@ -69,7 +70,11 @@ def test_a_fleet_of_one_set_answers_as_the_set(
         alone, together = sets["b11"].locate(record.scan), fleet.locate(record.scan)
         assert [each.hypothesis.pose for each in together] == [each.pose for each in alone]
         assert together[0].hypothesis.probability == alone[0].probability
-        assert together[0].hypothesis.accepted == alone[0].accepted
+        for one, other in zip(together, alone, strict=True):
+            assert one.hypothesis.accepted == other.accepted
+            assert one.hypothesis.evaluation == other.evaluation
+            assert one.hypothesis.reference == other.reference
+            assert np.array_equal(one.hypothesis.covariance, other.covariance)
 
 
 def test_neither_order_nor_threads_nor_parts_change_an_answer(
@@ -79,17 +84,21 @@ def test_neither_order_nor_threads_nor_parts_change_an_answer(
     for record in drives["later-b12"][:8]:
         scan = record.scan
         assert scan is not None
-        parts = [part for each in reversed(sets.items()) for part in search([each], scan)]
+        description = describe(scan, fleet.settings)
+        parts = [part for each in reversed(sets.items()) for part in search([each], description)]
         answers = [
             fleet.locate(scan),
             fleet.locate(scan, threads=2),
             backwards.locate(scan),
-            decide_over(parts, len(sets), fleet.settings.decision),
         ]
         shown = [
             [(each.building, each.hypothesis.pose, each.hypothesis.probability) for each in answer]
             for answer in answers
         ]
+        joined = decide_over(parts, len(sets), fleet.settings.decision)
+        shown.append(
+            [(each.building, Pose2D(*each.fit.poses[0]), each.probability) for each in joined]
+        )
         assert all(each == shown[0] for each in shown)
         probabilities = [each.hypothesis.probability for each in answers[0]]
         assert sum(probabilities) <= 1.0 + 1e-9
@@ -119,11 +128,12 @@ def test_more_sets_never_raise_a_probability(
 ) -> None:
     for record in drives["later-b13"][:8]:
         assert record.scan is not None
-        own = next(search([("b13", sets["b13"])], record.scan))
-        rest = list(search([(n, s) for n, s in sets.items() if n != "b13"], record.scan))
+        description = describe(record.scan, sets["b13"].settings)
+        own = next(search([("b13", sets["b13"])], description))
+        rest = list(search([(n, s) for n, s in sets.items() if n != "b13"], description))
         settings = sets["b13"].settings.decision
         chances = [
-            decide_over(found, count, settings, look_alikes=0.25)[0].hypothesis.probability
+            decide_over(found, count, settings, look_alikes=0.25)[0].probability
             for found, count in (([own], 1), ([own, *rest], 3), ([own, *rest], 1000))
         ]
         best = decide_over([own, *rest], 3, settings)[0]
@@ -182,7 +192,8 @@ def test_the_measurement_counts_what_it_says(
     assert record.scan is not None
     assert record.pose is not None
     asked = Asked("b11", record.scan, record.pose, False)
-    found = [(n, next(search([(n, s)], record.scan), None), 0.5) for n, s in sets.items()]
+    description = describe(record.scan, sets["b11"].settings)
+    found = [(n, next(search([(n, s)], description), None), 0.5) for n, s in sets.items()]
     settings = sets["b11"].settings.decision
     known, unknown = outcomes(asked, found, 2, settings)
     assert (known.is_known, known.is_right_building, known.is_correct) == (True, True, True)

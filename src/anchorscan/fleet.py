@@ -24,6 +24,9 @@ and what is held back goes to that rival.
 
 A part of the sets can be searched elsewhere, by a thread or by another machine: ``search`` gives
 values, and ``decide_over`` joins them, in any order of the parts, to the same answer.
+
+The scan is described once for all sets, and references are named for the few fits that are left
+of all sets together: done for each set, both took as long as the searches themselves.
 """
 
 from __future__ import annotations
@@ -32,14 +35,15 @@ import math
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from .decision import DecisionSettings, decide, worths
+from .decision import Decision, DecisionSettings, decide, worths
+from .description import Description, describe
 from .errors import ReferenceSetError, SettingsError
 from .hypothesis import Hypothesis
 from .reference_set import ReferenceSet
@@ -54,6 +58,7 @@ __all__ = [
     "TWINS",
     "BuildingFits",
     "BuildingHypothesis",
+    "BuildingPlace",
     "Fleet",
     "decide_over",
     "no_twin",
@@ -79,14 +84,29 @@ class BuildingFits:
     Args:
         building: Name of the set.
         anchors: How many anchor points the scan has.
-        fits: Of the highest worth first, as many as there are hypotheses.
-        hypotheses: One for every fit; their probabilities know of this set alone.
+        fits: Of the highest worth first, as many as one set has hypotheses.
     """
 
     building: str
     anchors: int
     fits: Fits
-    hypotheses: tuple[Hypothesis, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class BuildingPlace:
+    """A fit among those of all sets.
+
+    Args:
+        building: Name of the set.
+        fit: Of length one.
+        probability: Knows of all sets.
+        accepted: Whether it is an answer.
+    """
+
+    building: str
+    fit: Fits
+    probability: float
+    accepted: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,30 +202,45 @@ class Fleet:
             Hypotheses of all buildings, best first; none only for an unusable scan or from
             empty sets.
         """
+        description = describe(scan, self.settings)
         items = list(self._sets.items())
         if threads <= 1:
-            found = list(search(items, scan))
+            found = list(search(items, description))
         else:
             with ThreadPoolExecutor(threads) as pool:
-                parts = pool.map(lambda part: list(search(part, scan)), _shares(items, threads))
+                parts = pool.map(
+                    lambda part: list(search(part, description)), _shares(items, threads)
+                )
                 found = list(chain.from_iterable(parts))
-        return decide_over(found, len(self), self.settings.decision)
+        places = decide_over(found, len(self), self.settings.decision)
+        return list(chain.from_iterable(self._named(place, description) for place in places))
+
+    def _named(
+        self, place: BuildingPlace, description: Description
+    ) -> Iterator[BuildingHypothesis]:
+        """Name the reference of a place; nothing, if its set has lost all of them meanwhile."""
+        worth = np.array([place.probability])
+        decision = Decision(worth, 1.0 - place.probability, place.accepted)
+        for found in self._sets[place.building].hypotheses(description, place.fit, decision):
+            yield BuildingHypothesis(place.building, found)
 
 
-def search(sets: Iterable[tuple[str, ReferenceSet]], scan: LaserScan) -> Iterator[BuildingFits]:
+def search(
+    sets: Iterable[tuple[str, ReferenceSet]], description: Description
+) -> Iterator[BuildingFits]:
     """Search every set by itself; a set without a fit is passed over.
 
     Args:
         sets: Names and sets.
-        scan: The scan.
+        description: Of the scan, with the settings of the sets.
     """
+    if not len(description.angles.ranges):
+        return
     for name, places in sets:
-        trace = places.explain(scan)
-        if trace.in_map is not None and trace.hypotheses:
-            count = len(trace.in_map.hypotheses)
-            anchors = len(trace.description.anchors)
-            fits = trace.in_map.fits[:count]
-            yield BuildingFits(name, anchors, fits, trace.in_map.hypotheses)
+        fits = places.fits(description)
+        if fits is not None and len(fits):
+            count = places.settings.acceptance.hypotheses
+            yield BuildingFits(name, len(description.anchors), fits[:count])
 
 
 def decide_over(
@@ -213,7 +248,7 @@ def decide_over(
     sets: int,
     settings: DecisionSettings,
     look_alikes: float = LOOK_ALIKES,
-) -> list[BuildingHypothesis]:
+) -> list[BuildingPlace]:
     """Put what many sets found for one scan into one order, and decide once.
 
     Args:
@@ -223,7 +258,7 @@ def decide_over(
         look_alikes: How fast the odds fall with the number of sets.
 
     Returns:
-        Hypotheses of all buildings, best first, as many as one set gives at most.
+        Places in all buildings, best first, as many as one set gives at most.
     """
     if not found:
         return []
@@ -241,15 +276,13 @@ def decide_over(
         probabilities[rival] = min(probabilities[rival] + held_back, first)
     is_answer = probabilities[0] >= settings.threshold
     return [
-        BuildingHypothesis(
+        BuildingPlace(
             each.building,
-            replace(
-                each.hypotheses[n],
-                probability=probabilities[rank],
-                accepted=is_answer and rank == 0,
-            ),
+            fits[rank : rank + 1],
+            probabilities[rank],
+            is_answer and rank == 0,
         )
-        for rank, (each, n) in enumerate(best)
+        for rank, (each, _) in enumerate(best)
     ]
 
 

@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 
 from .building import random_building
 from .decision import DecisionSettings, covariance, evidence, held
+from .description import Description, describe
 from .errors import AnchorscanError
 from .fleet import LOOK_ALIKES, TWINS, BuildingFits, Fleet, no_twin, ranked, search
 from .pose import Pose2D
@@ -53,7 +54,7 @@ _STYLES = ("office", "hall", "lookalike")
 _REFERENCES = 48
 _DRIVE, _SECOND_DRIVE = 60.0, 40.0
 _MOVED, _TURNED = 0.3, 0.3
-_KEPT_FITS = 2
+_KEPT_FITS = 3
 _SCORE = FEATURES.index("score")
 _TWIN_AT = Pose2D(1000.0, -500.0, 1.0)
 _UNKNOWN_WEIGHT = 0.3
@@ -87,10 +88,11 @@ class Outcome:
         is_known: Whether its building was among them.
         evidence: (6,) of the best fit of all.
         held: How likely a pose of its covariance is to be near enough.
-        ceiling: The most that its margin to the best other building lets it be worth.
+        margin: Of its score to that of the best fit of another building; infinite where there
+            is none.
         is_right_building: Whether that fit is in the right building.
         is_correct: Whether building and pose are right.
-        seconds: All searches and the decision.
+        seconds: All searches and the decision; not the description of the scan, which is made once.
     """
 
     asked: Asked
@@ -98,7 +100,7 @@ class Outcome:
     is_known: bool
     evidence: NDArray[np.float64]
     held: float
-    ceiling: float
+    margin: float
     is_right_building: bool
     is_correct: bool
     seconds: float
@@ -142,6 +144,7 @@ def run(
         raise AnchorscanError("there is no building to ask for")
     for line in twins(cases, settings, queries, seed) if cases else ():
         say(line)
+    described = [describe(each.scan, settings) for each in asked]
     largest = max(sizes) + 1
     shards = _shards(cases, others, settings, seed, max(simulated, largest))
     needed = len(cases) + simulated
@@ -151,8 +154,8 @@ def run(
         if number >= total:
             break
         places.locate(asked[0].scan)  # derives the index
-        for each, so_far in zip(asked, found, strict=True):
-            so_far.append((name, *_timed(name, places, each.scan)))
+        for description, so_far in zip(described, found, strict=True):
+            so_far.append((name, *_timed(name, places, description)))
         for size in sizes:
             if number == max(size, needed) - 1 + (size >= needed):
                 say(f"{size} sets:")
@@ -254,11 +257,9 @@ def outcomes(
         )
         rival = next((k for k, (each, _) in enumerate(best) if each is not best[0][0]), None)
         scores = fits.features[:, _SCORE]
-        ceiling = 1.0 if rival is None else no_twin(float(scores[0] - scores[rival]))
+        margin = math.inf if rival is None else float(scores[0] - scores[rival])
         seconds += time.perf_counter() - start
-        yield Outcome(
-            asked, size, is_known, speaks, within, ceiling, right, right and near, seconds
-        )
+        yield Outcome(asked, size, is_known, speaks, within, margin, right, right and near, seconds)
 
 
 def probabilities(
@@ -269,7 +270,7 @@ def probabilities(
     speaks -= look_alikes * np.log([each.sets for each in results])
     likely: NDArray[np.float64] = np.array([each.held for each in results])
     likely /= 1.0 + np.exp(-speaks)
-    return np.minimum(likely, [each.ceiling for each in results])
+    return np.minimum(likely, [no_twin(each.margin) for each in results])
 
 
 def log_loss(results: Sequence[Outcome], look_alikes: float, settings: DecisionSettings) -> float:
@@ -337,17 +338,16 @@ def _rows(
         yield "| " + " | ".join(cells) + " |"
 
 
-def _timed(name: str, places: ReferenceSet, scan: LaserScan) -> tuple[BuildingFits | None, float]:
+def _timed(
+    name: str, places: ReferenceSet, description: Description
+) -> tuple[BuildingFits | None, float]:
     """Search one set, and keep of its fits what an order over all sets can need."""
-    fresh = LaserScan(  # nothing derived may be left over in it
-        scan.ranges, scan.angle_min, scan.angle_increment, scan.range_min, scan.range_max
-    )
     start = time.perf_counter()
-    found = next(search([(name, places)], fresh), None)
+    found = next(search([(name, places)], description), None)
     seconds = time.perf_counter() - start
     if found is None:
         return None, seconds
-    return BuildingFits(name, found.anchors, found.fits[:_KEPT_FITS], ()), seconds
+    return BuildingFits(name, found.anchors, found.fits[:_KEPT_FITS]), seconds
 
 
 def _thinned(case: Case, queries: int, seed: int) -> Iterator[tuple[LaserScan, Pose2D]]:

@@ -181,6 +181,27 @@ class Matcher:
             scan, description, singles, in_map, references, tuple(hypotheses), self.settings
         )
 
+    def fits(self, description: Description) -> Fits | None:
+        """Search the map for a scan, and leave the decision to who knows more maps.
+
+        Args:
+            description: Of the scan, by ``describe`` with the same settings.
+
+        Returns:
+            Of the highest worth first; None where there is no map.
+        """
+        return self._map.fits(description, self._most(None)) if self._map else None
+
+    def hypotheses(
+        self, description: Description, fits: Fits, decision: Decision
+    ) -> tuple[Hypothesis, ...]:
+        """Make hypotheses of what ``fits`` gave and what it was found to be worth.
+
+        Returns:
+            One for each of the first fits; none if the map has lost all references meanwhile.
+        """
+        return self._map.hypotheses(description, fits, decision)
+
     def follow(
         self, scan: LaserScan, poses: NDArray[np.float64], stiffness: NDArray[np.float64]
     ) -> Fits:

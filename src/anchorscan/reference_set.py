@@ -62,6 +62,8 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+    from .decision import Decision
+    from .description import Description
     from .matcher import Candidates, Matcher, Trace
     from .settings import Settings
     from .verification import Fits
@@ -523,6 +525,16 @@ class ReferenceSet:
     def explain(self, scan: LaserScan, candidates: Candidates = None) -> Trace:
         """Do what ``locate`` does and return every intermediate value."""
         return self._prepared().explain(scan, candidates)
+
+    def fits(self, description: Description) -> Fits | None:
+        """Search for a scan without a decision, as ``Matcher.fits`` does."""
+        return self._prepared().fits(description)
+
+    def hypotheses(
+        self, description: Description, fits: Fits, decision: Decision
+    ) -> tuple[Hypothesis, ...]:
+        """Make hypotheses of fits decided on elsewhere, as ``Matcher.hypotheses`` does."""
+        return self._prepared().hypotheses(description, fits, decision)
 
     def follow(
         self, scan: LaserScan, poses: NDArray[np.float64], stiffness: NDArray[np.float64]

@@ -261,20 +261,22 @@ class StitchedMap:
             most: How many references, the best by votes and what they saw, may propose; None
                 for all.
         """
-        settings, content = self._settings, self._content
-        tiles = content.tiles
-        seen = readings(description.angles, settings.verification)
-        large = on_large(seen)
-        votes = None if most is None else self._candidates(description, most, content)
-        related = content.landmarks if votes is None else self._some(votes.references, content)
-        proposed = proposals(description.anchors, large, related, tiles, settings.proposal)
-        if not len(proposed.poses):
-            proposed = _standing(content)
-        fits = verify(proposed.poses, seen, tiles, self._weights, settings.verification)
-        decision = decide(fits, len(description.anchors), settings.decision)
+        content = self._content
+        votes, proposed, fits = self._sought(description, most, content)
+        decision = decide(fits, len(description.anchors), self._settings.decision)
         hypotheses, known = self._hypotheses(description, fits, decision, content)
         references = tuple(each.reference for each in known)
         return MapSearch(votes, proposed, fits, decision, references, hypotheses)
+
+    def fits(self, description: Description, most: int | None) -> Fits:
+        """Search as ``search`` does, but neither decide nor name references."""
+        return self._sought(description, most, self._content)[2]
+
+    def hypotheses(
+        self, description: Description, fits: Fits, decision: Decision
+    ) -> tuple[Hypothesis, ...]:
+        """Name the references of fits that were decided on elsewhere."""
+        return self._hypotheses(description, fits, decision, self._content)[0]
 
     def follow(
         self, scan: LaserScan, poses: NDArray[np.float64], stiffness: NDArray[np.float64]
@@ -295,6 +297,21 @@ class StitchedMap:
             lots[n].identifiers[k] for n, k in zip(numbers.tolist(), places.tolist(), strict=True)
         ]
         return np.array(identifiers, np.int64), T_reference_scan
+
+    def _sought(
+        self, description: Description, most: int | None, content: _Content
+    ) -> tuple[Votes | None, Proposals, Fits]:
+        """Let relations propose poses, sieve and refine them."""
+        settings, tiles = self._settings, content.tiles
+        seen = readings(description.angles, settings.verification)
+        large = on_large(seen)
+        votes = None if most is None else self._candidates(description, most, content)
+        related = content.landmarks if votes is None else self._some(votes.references, content)
+        proposed = proposals(description.anchors, large, related, tiles, settings.proposal)
+        if not len(proposed.poses):
+            proposed = _standing(content)
+        fits = verify(proposed.poses, seen, tiles, self._weights, settings.verification)
+        return votes, proposed, fits
 
     def _hypotheses(
         self, description: Description, fits: Fits, decision: Decision, content: _Content
