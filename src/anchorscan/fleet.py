@@ -67,7 +67,7 @@ __all__ = [
     "set_files",
 ]
 
-LOOK_ALIKES = 0.25
+LOOK_ALIKES = 0.2
 """How fast the odds of an answer fall with the number of sets, beyond what the margin tells."""
 
 TWINS = 0.012
@@ -248,6 +248,7 @@ def decide_over(
     sets: int,
     settings: DecisionSettings,
     look_alikes: float = LOOK_ALIKES,
+    twins: float = TWINS,
 ) -> list[BuildingPlace]:
     """Put what many sets found for one scan into one order, and decide once.
 
@@ -256,6 +257,7 @@ def decide_over(
         sets: How many sets were asked, those without a fit as well.
         settings: Of the decision.
         look_alikes: How fast the odds fall with the number of sets.
+        twins: How far the scores of equal buildings lie apart.
 
     Returns:
         Places in all buildings, best first, as many as one set gives at most.
@@ -270,7 +272,7 @@ def decide_over(
     rival = next((k for k, (each, _) in enumerate(best) if each is not best[0][0]), None)
     if rival is not None:
         margin = float(fits.features[0, _SCORE] - fits.features[rival, _SCORE])
-        first = min(probabilities[0], no_twin(margin))
+        first = min(probabilities[0], no_twin(margin, twins))
         held_back = probabilities[0] - first
         probabilities = [min(value, first) for value in probabilities]
         probabilities[rival] = min(probabilities[rival] + held_back, first)
@@ -286,9 +288,9 @@ def decide_over(
     ]
 
 
-def no_twin(margin: float) -> float:
+def no_twin(margin: float, twins: float = TWINS) -> float:
     """Return the most that an answer can be worth, by its margin to the best other building."""
-    return 1.0 - 0.5 * math.exp(-0.5 * (max(margin, 0.0) / TWINS) ** 2)
+    return 1.0 - 0.5 * math.exp(-0.5 * (max(margin, 0.0) / twins) ** 2)
 
 
 def ranked(found: Sequence[BuildingFits]) -> tuple[list[tuple[BuildingFits, int]], Fits]:

@@ -16,8 +16,9 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
@@ -27,7 +28,7 @@ from .building import random_building
 from .decision import DecisionSettings, covariance, evidence, held
 from .description import Description, describe
 from .errors import AnchorscanError
-from .fleet import LOOK_ALIKES, TWINS, BuildingFits, Fleet, no_twin, ranked, search
+from .fleet import LOOK_ALIKES, TWINS, BuildingFits, Fleet, decide_over, no_twin, ranked, search
 from .pose import Pose2D
 from .progress import ProgressOf
 from .protocol import (
@@ -46,7 +47,18 @@ from .simulator import drive, random_poses, simulate
 from .verification import FEATURES
 from .world import World, move_furniture, turn_doors
 
-__all__ = ["Asked", "Outcome", "fitted", "log_loss", "outcomes", "run", "table", "twins"]
+__all__ = [
+    "Asked",
+    "Outcome",
+    "Twins",
+    "fitted",
+    "log_loss",
+    "outcomes",
+    "run",
+    "table",
+    "together",
+    "twins",
+]
 
 Item = TypeVar("Item")
 
@@ -114,6 +126,7 @@ def run(
     queries: int = 20,
     simulated: int = 10,
     seed: int = 0,
+    folder: Path | None = None,
     say: Callable[[str], None] = lambda line: None,
     progress: ProgressOf = lambda items, what, total=None: items,
 ) -> list[Outcome]:
@@ -127,22 +140,17 @@ def run(
         queries: At most so many of each building, at equal steps.
         simulated: So many of the simulated buildings have queries.
         seed: Of the simulated buildings.
+        folder: Where to write all sets with their indexes, to ask them once more as one fleet.
         say: Takes the lines of the tables.
         progress: Wraps what takes a while.
 
     Raises:
         AnchorscanError: There is no query.
     """
-    asked = [
-        Asked(case.place, scan, truth, True)
-        for case in cases
-        for scan, truth in _thinned(case, queries, seed)
-    ]
-    for number in range(simulated):
-        asked += _simulated_queries(number, seed, queries)
+    asked = _questions(cases, queries, simulated, seed)
     if not asked:
         raise AnchorscanError("there is no building to ask for")
-    for line in twins(cases, settings, queries, seed) if cases else ():
+    for line in twins(_twins(cases, settings, simulated, queries, seed), settings):
         say(line)
     described = [describe(each.scan, settings) for each in asked]
     largest = max(sizes) + 1
@@ -154,6 +162,8 @@ def run(
         if number >= total:
             break
         places.locate(asked[0].scan)  # derives the index
+        if folder is not None:
+            _keep(folder / f"{name}.apr", places, settings)
         for description, so_far in zip(described, found, strict=True):
             so_far.append((name, *_timed(name, places, description)))
         for size in sizes:
@@ -164,7 +174,77 @@ def run(
     results = [outcome for size in sizes for outcome in _all_outcomes(asked, found, size, settings)]
     for line in table(results, settings.decision):
         say(line)
+    if folder is not None:
+        del found
+        for line in together(folder, [each.scan for each in asked], settings):
+            say(line)
     return results
+
+
+def together(folder: Path, scans: Sequence[LaserScan], settings: Settings) -> Iterator[str]:
+    """Open all sets of a folder in this process, ask them, and tell what that takes.
+
+    Args:
+        folder: With the files of sets.
+        scans: To ask with.
+        settings: Of all sets.
+    """
+    before, start = _memory(), time.perf_counter()
+    fleet = Fleet.open([folder], settings=settings)
+    opened = time.perf_counter() - start
+    fleet.prepare()
+    prepared = time.perf_counter() - start - opened
+    for scan in scans:
+        fleet.locate(scan)
+    own, mapped = (after - at for after, at in zip(_memory(), before, strict=True))
+    yield (
+        f"{len(fleet)} sets opened in {opened:.1f} s and prepared in {prepared:.1f} s; they take "
+        f"{own:.0f} MB of memory and {mapped:.0f} MB of mapped files"
+    )
+    for threads in (1, 2):
+        spent, used = [], time.process_time()
+        for scan in scans:
+            start = time.perf_counter()
+            fleet.locate(scan, threads)
+            spent.append(time.perf_counter() - start)
+        used = (time.process_time() - used) / len(scans)
+        middle, late = (1e3 * float(np.percentile(spent, q)) for q in (50, 99))
+        yield (
+            f"a query by {threads} threads: median {middle:.0f} ms, 99 % {late:.0f} ms, "
+            f"{1e3 * used:.0f} ms of processor time"
+        )
+
+
+def _keep(path: Path, places: ReferenceSet, settings: Settings) -> None:
+    """Write a set and its index, if it is not there."""
+    if not path.exists():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        places.save(path)
+        with ReferenceSet.open(path, settings=settings) as stored:
+            stored.save_index()
+
+
+def _memory() -> tuple[float, float]:
+    """Return the megabytes of this process, its own and of files; NaN where nobody tells."""
+    try:
+        text = Path("/proc/self/status").read_text(encoding="ascii")
+    except OSError:
+        return math.nan, math.nan
+    told = dict(line.split(":", 1) for line in text.splitlines() if ":" in line)
+    own, mapped = (float(told[name].split()[0]) / 1024 for name in ("RssAnon", "RssFile"))
+    return own, mapped
+
+
+def _questions(cases: Sequence[Case], queries: int, simulated: int, seed: int) -> list[Asked]:
+    """Give the queries of real and of simulated buildings."""
+    asked = [
+        Asked(case.place, scan, truth, True)
+        for case in cases
+        for scan, truth in _thinned(case, queries, seed)
+    ]
+    for number in range(simulated):
+        asked += _simulated_queries(number, seed, queries)
+    return asked
 
 
 def _all_outcomes(
@@ -189,30 +269,85 @@ def _brief(results: Sequence[Outcome], settings: Settings) -> Iterator[str]:
             yield from _rows(some, LOOK_ALIKES, settings.decision)
 
 
-def twins(cases: Sequence[Case], settings: Settings, queries: int, seed: int = 0) -> Iterator[str]:
+def twins(buildings: Mapping[str, Iterable[Twins]], settings: Settings) -> Iterator[str]:
     """Ask every building together with its copy, and tell what comes of it, a line each.
 
     Args:
-        cases: Real buildings with sets and queries.
+        buildings: By their kind; what one kind says of the width is tried on the others.
         settings: Of all sets.
-        queries: At most so many of each building.
-        seed: Moves where the steps between queries begin.
     """
-    squares: list[float] = []
-    accepted = asked = 0
-    for case in cases:
-        places, twin = _set_of(case, Pose2D(), settings), _set_of(case, _TWIN_AT, settings)
-        fleet = Fleet({"one": places, "twin": twin})
-        for scan, _ in _thinned(case, queries, seed):
-            found = [places.locate(scan), twin.locate(scan)]
-            if all(found):
-                squares.append((found[0][0].score - found[1][0].score) ** 2)
-                accepted += fleet.locate(scan)[0].hypothesis.accepted
-                asked += 1
-    yield (
-        f"twins: {asked} scans, scores differ by {math.sqrt(float(np.mean(squares))):.4f} in the "
-        f"root mean square ({TWINS} is shipped); {accepted} answered, half of them wrong"
+    found = {
+        kind: [pair for each in some for pair in each.asked(settings)]
+        for kind, some in buildings.items()
+    }
+    widths = {kind: _width(pairs) for kind, pairs in found.items() if pairs}
+    for kind, width in widths.items():
+        tried = {"shipped": TWINS, **{other: widths[other] for other in widths if other != kind}}
+        told = [
+            f"{_answered(found[kind], value, settings)} answered with {value:.4f} ({label})"
+            for label, value in tried.items()
+        ]
+        yield (
+            f"twins, {kind}: {len(found[kind])} scans, scores differ by {width:.4f} in the root "
+            f"mean square; half of all answers are wrong: {', '.join(told)}"
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Twins:
+    """A building, its copy elsewhere, and scans of it.
+
+    Args:
+        places: Set of the one.
+        copy: Set of the other.
+        scans: To ask both with.
+    """
+
+    places: ReferenceSet
+    copy: ReferenceSet
+    scans: Sequence[LaserScan]
+
+    def asked(self, settings: Settings) -> Iterator[list[BuildingFits]]:
+        """Give what both find for every scan, where both find something."""
+        for scan in self.scans:
+            both = [("one", self.places), ("twin", self.copy)]
+            found = list(search(both, describe(scan, settings)))
+            if len(found) == len(both):
+                yield found
+
+
+def _width(pairs: Sequence[Sequence[BuildingFits]]) -> float:
+    scores = [[float(each.fits.features[0, _SCORE]) for each in pair] for pair in pairs]
+    return math.sqrt(float(np.mean([(one - twin) ** 2 for one, twin in scores])))
+
+
+def _answered(pairs: Sequence[Sequence[BuildingFits]], width: float, settings: Settings) -> int:
+    return sum(
+        decide_over(pair, len(pair), settings.decision, twins=width)[0].accepted for pair in pairs
     )
+
+
+def _twins(
+    cases: Sequence[Case], settings: Settings, simulated: int, queries: int, seed: int
+) -> dict[str, Iterator[Twins]]:
+    """Give real and simulated buildings with their copies, one after the other."""
+    real = (
+        Twins(
+            _set_of(case, Pose2D(), settings),
+            _set_of(case, _TWIN_AT, settings),
+            [scan for scan, _ in _thinned(case, queries, seed)],
+        )
+        for case in cases
+    )
+    invented = (
+        Twins(
+            _simulated_set(number, seed, settings),
+            _simulated_set(number, seed, settings, _TWIN_AT),
+            [each.scan for each in _simulated_queries(number, seed, queries)],
+        )
+        for number in range(simulated)
+    )
+    return {"real": real, "simulated": invented}
 
 
 def _set_of(case: Case, T_set_case: Pose2D, settings: Settings) -> ReferenceSet:
@@ -394,12 +529,16 @@ def _simulated_building(number: int, seed: int) -> World:
     )
 
 
-def _simulated_set(number: int, seed: int, settings: Settings) -> ReferenceSet:
+def _simulated_set(
+    number: int, seed: int, settings: Settings, T_set_world: Pose2D | None = None
+) -> ReferenceSet:
     """Scans at random places of a simulated building."""
     world, rng = _simulated_building(number, seed), np.random.default_rng(_seed(seed, number, 1))
     poses = random_poses(world, _REFERENCES, _seed(seed, number, 2))
     places = ReferenceSet(settings=settings)
-    places.add_batch([simulate(world, pose, SensorModel(), rng) for pose in poses], poses)
+    scans = [simulate(world, pose, SensorModel(), rng) for pose in poses]
+    moved = poses if T_set_world is None else [T_set_world @ pose for pose in poses]
+    places.add_batch(scans, moved)
     return places
 
 

@@ -216,6 +216,12 @@ def bench_fleet(
         int, typer.Option(min=0, max=10, metavar="N", help="Simulated buildings with queries.")
     ] = 10,
     seed: Annotated[int, typer.Option(help="Of the simulated buildings.")] = 0,
+    folder: Annotated[
+        Path | None,
+        typer.Option(
+            "--folder", help="Write all sets here, and ask them as one fleet: time and memory."
+        ),
+    ] = None,
     *,
     settings: SettingsOptions,
 ) -> None:
@@ -235,6 +241,7 @@ def bench_fleet(
         queries,
         simulated,
         seed,
+        folder,
         say=typer.echo,
         progress=progress,
     )
