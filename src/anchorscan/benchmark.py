@@ -302,7 +302,7 @@ def run(
     if spread is None or not spread.workers:
         scores = [each for task in todo for each in measure(task, methods, queries, seed, progress)]
     else:
-        known = [str(path) for path in paths if str(path) not in unread]
+        known = [_from_anywhere(path) for path in paths if str(path) not in unread]
         plan = _Plan(
             tuple(known),
             tuple(protocols),
@@ -751,6 +751,12 @@ def _building_and_path(log: str | Path) -> tuple[str, Path]:
     if isinstance(log, str) and separator and not Path(log).exists():
         return building, Path(path)
     return "", Path(log)
+
+
+def _from_anywhere(log: str | Path) -> str:
+    """Name a log so that a process in another working directory finds it."""
+    building, path = _building_and_path(log)
+    return f"{building}={path.absolute()}" if building else str(path.absolute())
 
 
 def _name(path: Path) -> str:

@@ -103,7 +103,7 @@ def build(
         raise typer.BadParameter("a map is built from alone: no other logs, no topics or poses")
     recipe = _Recipe(
         LogOptions(field_of_view, range_max, topic, upside_down).reading(),
-        {"poses": poses, "poses_of": poses_of.value, "T_base_laser": laser},
+        {"poses": _from_anywhere(poses), "poses_of": poses_of.value, "T_base_laser": laser},
         spacing,
         None if heading is None else math.radians(heading),
         keep_all,
@@ -124,6 +124,13 @@ def build(
         say(_built(recipe, logs[0], read, output))
     _write_index(output, index)
     _tell_unread(unread, len(logs))
+
+
+def _from_anywhere(poses: str | None) -> str | None:
+    """Name a file of poses, if it is one, so that another working directory has it, too."""
+    if poses is None or not Path(poses).is_file():
+        return poses
+    return str(Path(poses).absolute())
 
 
 @dataclass(frozen=True)
@@ -210,7 +217,7 @@ def _read_logs(
     recipe: _Recipe, logs: list[Path], spread: Spread, unread: list[str]
 ) -> Iterator[Record]:
     """Give the records of logs that were read whole, in their order."""
-    for done in spread.map(_read_piece, [(recipe, log) for log in logs]):
+    for done in spread.map(_read_piece, _pieces(recipe, logs, spread)):
         if done.value is None:
             unread.append(str(done.error))
             continue
@@ -218,6 +225,13 @@ def _read_logs(
         for line in told:
             say(line)
         yield from records
+    if len(unread) == len(logs):
+        _tell_unread(unread, len(logs))
+
+
+def _pieces(recipe: _Recipe, logs: list[Path], spread: Spread) -> list[tuple[_Recipe, Path]]:
+    """Name the logs so that workers find them, whose working directory is another one."""
+    return [(recipe, log.absolute() if spread.workers else log) for log in logs]
 
 
 def _read_piece(piece: tuple[_Recipe, Path]) -> tuple[list[Record], list[str]]:
@@ -253,9 +267,9 @@ def _build_each(
         raise typer.BadParameter("two logs have the same name: their sets would, too")
     left = [log for log in logs if not targets[log].exists()]
     unread: list[str] = []
-    pieces = spread.map(_set_piece, [(recipe, log) for log in left])
-    for done in progress(pieces, "building", len(left)):
-        log = done.item[1]
+    pieces = spread.map(_set_piece, _pieces(recipe, left, spread))
+    built = zip(left, pieces, strict=True)
+    for log, done in progress(built, "building", len(left)):
         if done.value is None:
             unread.append(str(done.error))
             continue
