@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
+import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from dataclasses import replace
@@ -149,3 +152,84 @@ def test_a_cluster_that_cannot_be_had_is_one_line() -> None:
         pass
     with pytest.raises(AnchorscanError, match="no scheduler"), cluster("nonsense"):
         pass
+
+
+@pytest.fixture
+def scheduler(tmp_path: Path) -> Iterator[str]:
+    """A scheduler and two workers, each by its own command line in its own folder."""
+    pytest.importorskip("distributed", reason="the cluster is an extra")
+    told = tmp_path / "scheduler.json"
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    commands = [
+        ("scheduler", "--host", "127.0.0.1", "--port", "0"),
+        ("worker", "--nthreads", "1", "--no-nanny", "--host", "127.0.0.1"),
+        ("worker", "--nthreads", "1", "--no-nanny", "--host", "127.0.0.1"),
+    ]
+    started = []
+    try:
+        for number, words in enumerate(commands):
+            folder = tmp_path / f"process-{number}"
+            folder.mkdir()
+            command = [sys.executable, "-m", "dask", *words, "--no-dashboard"]
+            with (folder / "log").open("wb") as log:
+                started.append(
+                    subprocess.Popen(
+                        [*command, "--scheduler-file", str(told)],
+                        cwd=folder,
+                        env=environment,
+                        stdout=log,
+                        stderr=log,
+                    )
+                )
+        end = time.monotonic() + 60.0
+        while not told.exists() and time.monotonic() < end:
+            time.sleep(0.05)
+        address = str(json.loads(told.read_text())["address"])
+        with cluster(address) as spread:
+            while spread.workers < 2 and time.monotonic() < end:
+                time.sleep(0.05)
+        yield address
+    finally:
+        for process in reversed(started):
+            process.kill()
+            process.wait()
+
+
+def test_workers_of_a_scheduler_find_logs_and_one_may_die(
+    scheduler: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    building = random_building(11, length=24.0, depth=14.0)
+    records = drive(building, seed=1, length=60.0)
+    write_log(tmp_path / "first.log", records[::2])
+    write_log(tmp_path / "second.log", drive(building, seed=2, length=6.0))
+    monkeypatch.chdir(tmp_path)  # where no worker is
+    words = ("first.log", "missing.log", "second.log", "--field-of-view", 180)
+    here = run("build", *words, "-o", "here.apr")
+    there = run("build", *words, "-o", "there.apr", "--scheduler", scheduler)
+    assert (here.code, there.code) == (1, 1)
+    assert "1 of 3" in there.err
+    assert Path("here.apr").read_bytes() == Path("there.apr").read_bytes()
+    nothing = run("build", "no.log", "none.log", "-o", "x.apr", "--scheduler", scheduler)
+    assert nothing.code == 1
+    assert "no.log" in nothing.err
+    assert "2 of 2" in nothing.err
+
+    def facts(spread: Spread | None) -> list[object]:
+        board = benchmark.run(
+            ["first.log"],
+            protocols=("P1",),
+            candidates=(None,),
+            queries=20,
+            baselines=(),
+            spread=spread,
+        )
+        return [(s.place, s.method, list(map(_timeless, s.answers))) for s in board.scores]
+
+    marks = tmp_path / "marks"
+    marks.mkdir()
+    with cluster(scheduler) as spread:
+        assert spread.workers == 2
+        done = list(spread.map(counted, [(str(marks), number) for number in ITEMS]))
+        assert [each.value for each in done] == ITEMS
+        assert spread.workers == 1
+        assert facts(spread) == facts(None)

@@ -55,7 +55,7 @@ class ScanIn(BaseModel):
 
     def scan(self) -> LaserScan:
         """Return what it stands for."""
-        return scan_of(self.model_dump(include=set(_SCAN_FIELDS)))
+        return scan_of({name: getattr(self, name) for name in _SCAN_FIELDS})
 
 
 _SCAN_FIELDS = ("angle_min", "angle_increment", "ranges", "range_min", "range_max")
