@@ -68,10 +68,10 @@ __all__ = [
 ]
 
 LOOK_ALIKES = 0.2
-"""How fast the odds of an answer fall with the number of sets, beyond what the margin tells."""
+"""How fast the odds fall with the number of sets, beyond the margin; fitted on simulated scans."""
 
-TWINS = 0.012
-"""Root mean square of the difference of one scan's scores in two equal buildings."""
+TWINS = 0.018
+"""Root mean square of the difference of a scan's scores in two equal, simulated buildings."""
 
 _SCORE = FEATURES.index("score")
 _SUFFIX = ".apr"
