@@ -148,7 +148,7 @@ class Fleet:
                     f"the sets {first} and {name} have different settings: "
                     "give the same to all, for instance by a preset"
                 )
-            if any(reference.pose is None for reference in places.references):
+            if not places.has_poses:
                 raise ReferenceSetError(
                     f"{name}: has references without a pose, which have no common map to ask"
                 )

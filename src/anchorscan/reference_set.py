@@ -309,6 +309,13 @@ class ReferenceSet:
                 self._listed = tuple(map(self._references.__getitem__, sorted(self._references)))
         return self._listed
 
+    @property
+    def has_poses(self) -> bool:
+        """Whether every reference has a pose; those of an index have, and are not read for it."""
+        known = self._references
+        told = known.added if isinstance(known, IndexedReferences) else known.values()
+        return all(reference.pose is not None for reference in told)
+
     def __len__(self) -> int:
         return len(self._references)
 
