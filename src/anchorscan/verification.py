@@ -14,6 +14,10 @@ Fits are ordered by their *worth*: what the map leaves unexplained and what it c
 with the score ``s`` and the share of rays that pass through known surfaces.  Where references
 are sparse and little of a scan can be explained, a wrong pose explains as much by chance, and
 often from behind a wall; where they are dense, a door that was opened since costs little.
+
+The paper's anchor points come from large surfaces, since these stay; so what is small may be
+new.  At every pose the score is the better one of two worlds: as it was, and with new things in
+it, for a price (see ``field.better_score``).
 """
 
 from __future__ import annotations
