@@ -91,8 +91,9 @@ TOKENS_VARIABLE = "ANCHORSCAN_TOKENS"
 
 _OPTIONS_VARIABLE = "ANCHORSCAN_SERVICE"
 _SHORTEST_TOKEN = 16
-# Seconds in which a worker answers: on a busy machine one that only starts was taken for dead.
-_SLOWEST_START = 60
+# Seconds in which a worker answers: on a busy machine one that only starts was taken for dead.  As
+# long the service may wait for one that was killed while it was asked, so not much longer.
+_SLOWEST_START = 20
 _LOOPBACK = {"127.0.0.1", "localhost", "::1"}
 _METRICS_FOLDER = "PROMETHEUS_MULTIPROC_DIR"
 _SQLITE = "application/vnd.sqlite3"
