@@ -95,4 +95,4 @@ def test_small_things_are_runs_that_are_short_along_their_way(scan, extent):
         if i + 1 == len(angles.ranges) or angles.gaps[i] != CONNECTED:
             expected += [angles.way[run[-1]] - angles.way[run[0]] < extent] * len(run)
             run = []
-    assert is_small(angles, extent).tolist() == expected
+    assert is_small(angles.runs, angles.way, extent).tolist() == expected

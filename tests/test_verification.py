@@ -171,7 +171,7 @@ def test_poses_go_through_the_sieves_as_the_twins_say(mapped, seed, limits, coun
 def test_readings_are_on_small_things_unless_hardly_any_are_not(mapped, seed, extent):
     scan, _ = mapped[1][seed % len(mapped[1])]
     angles = angle_function(scan, AngleFunctionSettings())
-    small = is_small(angles, extent)
+    small = is_small(angles.runs, angles.way, extent)
     large = int(np.sum(~small))
     if large < 20 or large < 0.25 * len(small):
         small = np.zeros(len(small))

@@ -53,22 +53,14 @@ def segments(angles: AngleFunction, settings: SegmentSettings) -> Segments:
     return Segments(first, last)
 
 
-def is_small(angles: AngleFunction, extent: float) -> NDArray[np.bool_]:
-    """Tell which returns lie on things along which the way is shorter than ``extent``.
+@kernel
+def is_small(runs, way, extent):  # type: ignore[no-untyped-def]
+    """(V,) which returns lie on things along which the way is shorter than ``extent``, metres.
 
     A thing is a run of returns without a gap, whatever its number of readings: a person, the leg
-    of a table, a single reading out of place.
-
-    Returns:
-        (V,) for every return.
+    of a table, a single reading out of place.  ``runs`` and ``way`` are those of the angle
+    function.
     """
-    small: NDArray[np.bool_] = _is_small(angles.runs, angles.way, extent)
-    return small
-
-
-@kernel
-def _is_small(runs, way, extent):  # type: ignore[no-untyped-def]
-    """Whether the run of each return is shorter than an extent."""
     small = np.empty(len(runs), np.bool_)
     last = len(runs) - 1
     for i in range(len(runs) - 1, -1, -1):

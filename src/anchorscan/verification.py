@@ -44,7 +44,7 @@ from .field import (
     refined,
 )
 from .proposal import spread
-from .segments import _is_small
+from .segments import is_small
 
 __all__ = [
     "FEATURES",
@@ -156,7 +156,7 @@ def on_large(readings):  # type: ignore[no-untyped-def]
 @kernel
 def _readings(points, runs, way, extent):  # type: ignore[no-untyped-def]
     """Points, and 1 for those on small things, unless hardly any are not."""
-    small = _is_small(runs, way, extent)
+    small = is_small(runs, way, extent)
     large = len(small) - np.count_nonzero(small)
     if large < _FEWEST_LARGE or large < _SMALLEST_SHARE * len(small):
         small[:] = False
