@@ -22,7 +22,7 @@ ROOT = PACKAGE.parents[1]
 # gets its place here; one that fits nowhere is a sign that it does two things.
 ORDER = (
     *("errors", "progress", "cluster", "pose", "scan", "record", "reference"),
-    *("protocol", "journey"),
+    *("regression", "protocol", "journey"),
     *("array_file", "_jit"),
     *("angle_function", "segments", "anchors", "graph"),
     *("length_relation", "oriented_relation", "database", "panorama", "alignment"),

@@ -27,9 +27,10 @@ from numpy.typing import NDArray
 
 from .matcher import Matcher
 from .pose import Pose2D
-from .protocol import CORRECT_HEADING, CORRECT_POSITION, Case, choose_references, thin
+from .protocol import Case, choose_references, is_correct, thin
 from .record import Record
 from .reference import Reference
+from .regression import logistic_regression
 from .scan import LaserScan
 from .settings import Settings
 
@@ -43,7 +44,6 @@ _REGIONS = 8
 _AROUND, _AWAY = 5.0, 10.0
 _LEAST_PROBABILITY = 1e-4
 _RIDGE = 1e-3
-_STEPS = 50
 
 
 class Drive(Protocol):
@@ -173,7 +173,7 @@ def fit(samples: Sequence[Answers], without: str = "") -> Fit:
     """
     used = [sample for sample in samples if without not in sample.buildings]
     x, y, weights = _rows(used)
-    constant, weight = _logistic(x, y, weights)
+    constant, weight = logistic_regression(x, y, weights, _RIDGE).tolist()
     scored = [sample for sample in samples if without in sample.buildings] or samples
     right, elsewhere, ended = (
         _sure(scored, kind, constant, weight) for kind in ("right", "elsewhere", "unmapped")
@@ -196,12 +196,7 @@ def _asked(matcher: Matcher, asked: Sequence[Asked]) -> list[tuple[float, bool]]
             continue
         p = float(search.decision.probabilities[0])
         p = min(max(p, _LEAST_PROBABILITY), 1.0 - _LEAST_PROBABILITY)
-        found = Pose2D.from_array(search.fits.poses[0])
-        right = (
-            truth is not None
-            and found.distance(truth) <= CORRECT_POSITION
-            and found.turn(truth) <= CORRECT_HEADING
-        )
+        right = is_correct(Pose2D.from_array(search.fits.poses[0]), truth)
         answers.append((math.log(p / (1.0 - p)), right))
     return answers
 
@@ -223,7 +218,7 @@ def _distance(record: Record, centre: Pose2D) -> float:
 def _rows(
     samples: Sequence[Answers],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Log odds, whether right, and weights of all answers."""
+    """(N, 2) one and log odds, whether right, and weights of all answers."""
     kinds = [sample.kind for sample in samples]
     others = len({*kinds} - {"right"})
     if not others or "right" not in kinds:
@@ -235,25 +230,7 @@ def _rows(
         weights.append(np.full(len(sample.log_odds), share))
     right = [np.full(len(each.log_odds), each.kind == "right", np.float64) for each in samples]
     x = np.concatenate([sample.log_odds for sample in samples])
-    return x, np.concatenate(right), np.concatenate(weights)
-
-
-def _logistic(
-    log_odds: NDArray[np.float64], right: NDArray[np.float64], weights: NDArray[np.float64]
-) -> tuple[float, float]:
-    """Weighted logistic regression on one number, with a small ridge, by Newton's method."""
-    x = np.column_stack((np.ones(len(log_odds)), log_odds))
-    found = np.zeros(2)
-    for _ in range(_STEPS):
-        p = 1.0 / (1.0 + np.exp(-np.clip(x @ found, -30.0, 30.0)))
-        gradient = x.T @ (weights * (p - right)) + _RIDGE * found
-        curvature = (x.T * (weights * p * (1.0 - p))) @ x + _RIDGE * np.eye(2)
-        step = np.linalg.solve(curvature, gradient)
-        step *= min(1.0, 2.0 / max(float(np.abs(step).max()), 1e-12))
-        found = found - step
-        if float(np.abs(step).max()) < 1e-9:
-            break
-    return float(found[0]), float(found[1])
+    return np.column_stack((np.ones(len(x)), x)), np.concatenate(right), np.concatenate(weights)
 
 
 def _sure(samples: Sequence[Answers], kind: str, constant: float, weight: float) -> float:

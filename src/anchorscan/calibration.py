@@ -24,7 +24,8 @@ from numpy.typing import NDArray
 from .decision import evidence
 from .matcher import Matcher
 from .pose import Pose2D
-from .protocol import CORRECT_HEADING, CORRECT_POSITION, Case, recall_at_precision, reliability
+from .protocol import Case, is_correct, recall_at_precision, reliability
+from .regression import logistic_regression
 from .scan import LaserScan
 from .settings import Settings
 from .simulator import occlude
@@ -34,7 +35,6 @@ __all__ = ["Fit", "Sample", "fit", "gather", "rotate", "weigh"]
 _PROTOCOL_WEIGHTS = {"P1": 1.0, "P2": 0.5, "P3": 1.0, "P4": 0.03}
 _RIDGE = 0.02
 _CROWDS = (0.0, 0.1, 0.2)
-_STEPS = 50
 _COEFFICIENTS = ("constant", "log_margin", "explained", "through", "heading", "anchors")
 
 
@@ -123,7 +123,7 @@ def _asked(
         search = trace.in_map
         if search is not None and len(search.fits):
             rows.append(evidence(search.fits, len(trace.description.anchors)))
-            right.append(_is_right(search.fits.poses[0], truth))
+            right.append(is_correct(Pose2D.from_array(search.fits.poses[0]), truth))
     return np.array(rows), np.array(right, bool)
 
 
@@ -159,15 +159,8 @@ def fit(sample: Sample, coefficients: NDArray[np.float64], threshold: float) -> 
     )
 
 
-def _is_right(pose: NDArray[np.float64], truth: Pose2D | None) -> bool:
-    if truth is None:
-        return False
-    found = Pose2D.from_array(pose)
-    return found.distance(truth) <= CORRECT_POSITION and found.turn(truth) <= CORRECT_HEADING
-
-
 def _logistic(samples: Sequence[Sample]) -> NDArray[np.float64]:
-    """Ridge-regularised logistic regression by Newton's method."""
+    """Ridge-regularised logistic regression, splits weighed as the module says."""
     x = np.concatenate([sample.evidence for sample in samples])
     y = np.concatenate([sample.correct for sample in samples]).astype(np.float64)
     weights = np.concatenate(
@@ -180,15 +173,4 @@ def _logistic(samples: Sequence[Sample]) -> NDArray[np.float64]:
         ]
     )
     weights *= len(weights) / weights.sum()
-    coefficients = np.zeros(x.shape[1])
-    for _ in range(_STEPS):
-        # Bounded, so that separable samples do not run away between steps.
-        p = 1.0 / (1.0 + np.exp(-np.clip(x @ coefficients, -30.0, 30.0)))
-        gradient = x.T @ (weights * (p - y)) + 2.0 * _RIDGE * coefficients
-        curvature = (x.T * (weights * np.maximum(p * (1.0 - p), 1e-6))) @ x
-        step = np.linalg.solve(curvature + 2.0 * _RIDGE * np.eye(x.shape[1]), gradient)
-        step *= min(1.0, 2.0 / max(float(np.abs(step).max()), 1e-12))
-        coefficients = coefficients - step
-        if float(np.abs(step).max()) < 1e-9:
-            break
-    return coefficients
+    return logistic_regression(x, y, weights, 2.0 * _RIDGE)

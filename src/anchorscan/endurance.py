@@ -29,7 +29,7 @@ from .errors import AnchorscanError
 from .localizer import Localizer
 from .pose import Pose2D
 from .progress import ProgressOf
-from .protocol import CORRECT_HEADING, CORRECT_POSITION
+from .protocol import is_correct
 from .record import Record
 from .reference_set import ReferenceSet
 from .robot import Report, Robot
@@ -226,4 +226,4 @@ def _is_right(report: Report, truth: Pose2D | None) -> bool:
     found = report.T_map_base
     if found is None or truth is None:
         return truth is None
-    return found.distance(truth) <= CORRECT_POSITION and found.turn(truth) <= CORRECT_HEADING
+    return is_correct(found, truth)

@@ -31,14 +31,7 @@ from .errors import AnchorscanError
 from .fleet import LOOK_ALIKES, TWINS, BuildingFits, Fleet, decide_over, no_twin, ranked, search
 from .pose import Pose2D
 from .progress import ProgressOf
-from .protocol import (
-    CORRECT_HEADING,
-    CORRECT_POSITION,
-    Case,
-    recall_at_precision,
-    reliability,
-    thin,
-)
+from .protocol import Case, is_correct, recall_at_precision, reliability, thin
 from .reference_set import ReferenceSet
 from .scan import LaserScan
 from .sensor import SensorModel
@@ -387,11 +380,7 @@ def outcomes(
         within = held(covariance(fits[:1], settings)[0])
         speaks = evidence(fits, best[0][0].anchors)
         right = is_known and best[0][0].building == asked.building
-        found_pose = Pose2D.from_array(fits.poses[0])
-        near = (
-            found_pose.distance(asked.truth) <= CORRECT_POSITION
-            and found_pose.turn(asked.truth) <= CORRECT_HEADING
-        )
+        near = is_correct(Pose2D.from_array(fits.poses[0]), asked.truth)
         rival = next((k for k, (each, _) in enumerate(best) if each is not best[0][0]), None)
         scores = fits.features[:, _SCORE]
         margin = math.inf if rival is None else float(scores[0] - scores[rival])

@@ -45,7 +45,7 @@ from .graph import AnchorGraph
 from .panorama import DIRECTIONS, panorama, reordered, view, worth
 from .pose import Pose2D
 from .proposal import joined, landmarks, proposals
-from .protocol import CORRECT_HEADING, CORRECT_POSITION, thin
+from .protocol import is_correct, thin
 from .reference import Reference
 from .scan import LaserScan
 from .settings import Settings
@@ -340,8 +340,7 @@ class _Asked:
         fits = verify(proposed.poses, seen, self._tiles, self._weights, settings.verification)
         if not len(fits):
             return False
-        found = Pose2D(*fits.poses[0].tolist())
-        return found.distance(truth) <= CORRECT_POSITION and found.turn(truth) <= CORRECT_HEADING
+        return is_correct(Pose2D(*fits.poses[0].tolist()), truth)
 
 
 def _pose(reference: Reference) -> Pose2D:

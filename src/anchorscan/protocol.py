@@ -38,6 +38,7 @@ __all__ = [
     "Split",
     "choose_references",
     "figures",
+    "is_correct",
     "precision_recall",
     "recall_at_precision",
     "reliability",
@@ -59,6 +60,13 @@ _SPARSE_STEP = 0.5
 _BINS = 10
 # Shares of wrong answers are compared with this slack, so that 1 of 100 is 1 %.
 _SLACK = 1e-9
+
+
+def is_correct(found: Pose2D, truth: Pose2D | None) -> bool:
+    """Tell whether a pose is right: within half a metre and ten degrees of the truth, if any."""
+    if truth is None:
+        return False
+    return found.distance(truth) <= CORRECT_POSITION and found.turn(truth) <= CORRECT_HEADING
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ import numpy as np
 from .plausibility import Plausibility, mirror_check, mirror_image
 from .pose import Pose2D
 from .progress import ProgressOf
-from .protocol import CORRECT_HEADING, CORRECT_POSITION, Case, Split, thin
+from .protocol import Case, Split, is_correct, thin
 from .record import Record
 from .reference_set import ReferenceSet
 from .scan import LaserScan
@@ -187,9 +187,7 @@ def _ask(places: ReferenceSet, records: Sequence[Record], scale: float = 1.0) ->
             continue
         accepted += 1
         truth = scaled(record, scale).pose
-        if best.pose is not None and truth is not None:
-            near = best.pose.distance(truth) <= CORRECT_POSITION
-            correct += near and best.pose.turn(truth) <= CORRECT_HEADING
+        correct += best.pose is not None and is_correct(best.pose, truth)
     return Told(accepted, correct)
 
 
