@@ -21,6 +21,7 @@ from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, 
 
 from anchorscan import (
     LaserScan,
+    Matcher,
     Pose2D,
     Record,
     Reference,
@@ -202,6 +203,14 @@ class TestValues:
         assert opened[0].pose is None
         assert opened[0].name == "kitchen"
         assert opened.info().bounds is None
+
+    def test_its_references_can_be_gone_through_and_searched_by_a_matcher(self) -> None:
+        places = ReferenceSet()
+        places.add_batch([SCAN, SCAN, SCAN], [None] * 3, ["hall", "kitchen", "stairs"])
+        places.remove(0)
+        assert list(places) == list(places.references)
+        assert [each.name for each in places] == ["kitchen", "stairs"]
+        assert [each.identifier for each in Matcher(places).references] == [1, 2]
 
     def test_a_closed_set_cannot_be_changed(self, tmp_path: Path) -> None:
         places = ReferenceSet(path=tmp_path / "a.apr")

@@ -319,6 +319,9 @@ class ReferenceSet:
     def __len__(self) -> int:
         return len(self._references)
 
+    def __iter__(self) -> Iterator[Reference]:
+        return iter(self.references)
+
     def __contains__(self, identifier: object) -> bool:
         return identifier in self._references
 
