@@ -17,7 +17,6 @@ from anchorscan.belief import (
     Found,
     Mixture,
     _certain,
-    _inverses,
     _moved,
     _new,
     _owners,
@@ -87,14 +86,6 @@ def total(mixture):
 
 
 # The twins
-
-
-@given(seed=seeds)
-def test_inverses_are_those_of_linear_algebra(seed):
-    matrices = some_covariances(np.random.default_rng(seed), 6)
-    out = _inverses(matrices)
-    assert np.allclose(out, np.linalg.inv(matrices), rtol=1e-6)
-    assert np.array_equal(out, out.transpose(0, 2, 1))
 
 
 @given(seed=seeds, spurious=st.floats(0.0, 0.5))

@@ -28,7 +28,6 @@ from anchorscan.decision import (
     covariance,
     decide,
     evidence,
-    held,
 )
 from anchorscan.verification import FEATURES, Fits
 from anchorscan.world import World
@@ -72,29 +71,6 @@ def test_between_two_endless_walls_nothing_is_an_answer() -> None:
     )
     best = corridor.locate(simulate(World(walls), Pose2D(3.3, 1.0, -0.4), sensor))[0]
     assert not best.accepted
-
-
-@given(
-    deviations=st.tuples(*[st.floats(0.01, 3.0)] * 3),
-    turn=st.floats(-3.0, 3.0),
-)
-@settings(max_examples=25)
-def test_what_is_held_is_the_share_of_the_covariance_that_counts_as_correct(
-    deviations: tuple[float, float, float], turn: float
-) -> None:
-    c, s = math.cos(turn), math.sin(turn)
-    rotation = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-    spread: NDArray[np.float64] = np.diag(np.square(deviations))
-    samples = np.random.default_rng(0).standard_normal((20_000, 3)) * deviations
-    limits = (0.5, 0.5, math.radians(10.0))
-    expected = float(np.mean((np.abs(samples) <= limits).all(axis=1)))
-    assert held(rotation @ spread @ rotation.T) == pytest.approx(expected, abs=0.015)
-
-
-def test_a_pose_that_is_exact_is_held_and_one_that_is_not_is_not() -> None:
-    assert held(np.zeros((3, 3))) == 1.0
-    assert held(np.diag([25.0, 1e-4, 1e-6])) < 0.1
-    assert held(np.diag([1e-4, 1e-4, 1.0])) < 0.2
 
 
 # Fits as the verification gives them, with only those numbers that the decision looks at.

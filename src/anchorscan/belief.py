@@ -67,6 +67,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from ._jit import kernel
 from .angle_function import wrapped
+from .covariance import inverses
 from .field import FieldSettings, Weights
 from .motion import Motion, MotionSettings
 from .verification import FEATURES, LARGEST_SCORE, Fits
@@ -338,7 +339,7 @@ def claimed(mixture: Mixture, found: Found, settings: BeliefSettings) -> Claim |
 
 def stiffness(mixture: Mixture, settings: BeliefSettings) -> NDArray[np.float64]:
     """Return (K, 3, 3) how firmly each place holds its pose against the readings of a scan."""
-    held: NDArray[np.float64] = _inverses(mixture.covariances) * settings.reading_deviation**2
+    held: NDArray[np.float64] = inverses(mixture.covariances) * settings.reading_deviation**2
     return held
 
 
@@ -409,7 +410,7 @@ def weighed(
     new *= np.clip(fits.features[:, _SCORE], 0.0, 1.0) / (1.0 + np.exp(-plain))
     information = _certain(fits.hessians, settings.spurious)
     information *= (new / settings.reading_deviation**2)[:, None, None]
-    covariances = _inverses(_inverses(mixture.covariances) + information)
+    covariances = inverses(inverses(mixture.covariances) + information)
     latest = min(share * settings.way_alike / settings.record_way, 1.0)
     record = np.where(known, mixture.record + latest * (odds - mixture.record), odds)
     return Mixture(fits.poses, covariances, weights, odds, record, answered, unsearched, nowhere)
@@ -532,24 +533,6 @@ def _certain(hessians, spurious):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _inverses(matrices):  # type: ignore[no-untyped-def]
-    """Inverse of every symmetric (3, 3) matrix, symmetric by construction."""
-    out = np.empty(matrices.shape)
-    for k in range(len(matrices)):
-        h = matrices[k]
-        a, b, c, d, e, f = h[0, 0], h[0, 1], h[0, 2], h[1, 1], h[1, 2], h[2, 2]
-        p, q, r = d * f - e * e, c * e - b * f, b * e - c * d
-        s, t, u = a * f - c * c, b * c - a * e, a * d - b * b
-        determinant = a * p + b * q + c * r
-        out[k, 0, 0], out[k, 1, 1], out[k, 2, 2] = p, s, u
-        out[k, 0, 1] = out[k, 1, 0] = q
-        out[k, 0, 2] = out[k, 2, 0] = r
-        out[k, 1, 2] = out[k, 2, 1] = t
-        out[k] /= determinant
-    return out
-
-
-@kernel
 def _is_same(a, b, same):  # type: ignore[no-untyped-def]
     """Whether two poses are one place."""
     return math.hypot(a[0] - b[0], a[1] - b[1]) < same[0] and abs(wrapped(a[2] - b[2])) < same[1]
@@ -576,7 +559,7 @@ def _new(known, found, same, reach):  # type: ignore[no-untyped-def]
     count = 0
     for n in range(len(found[0])):
         is_new, parent, best = True, -1, -np.inf
-        information = _inverses(covariances + found[1][n])
+        information = inverses(covariances + found[1][n])
         for k in range(len(poses)):
             if _is_same(found[0][n], poses[k], same):
                 is_new = False

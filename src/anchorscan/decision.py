@@ -45,14 +45,14 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
 from ._jit import kernel
+from .covariance import held, inverses
 from .verification import FEATURES, LARGEST_SCORE, Fits, worth
 
-__all__ = ["Decision", "DecisionSettings", "covariance", "decide", "evidence", "held", "worths"]
+__all__ = ["Decision", "DecisionSettings", "covariance", "decide", "evidence", "worths"]
 
 _SCORE, _THROUGH = FEATURES.index("score"), FEATURES.index("through")
 _SMALLEST_MARGIN = 0.003
 _MANY_READINGS, _LUCKY_READINGS = 120, 10.0
-_CORRECT_POSITION, _CORRECT_HEADING = 0.5, math.radians(10.0)
 
 
 class DecisionSettings(BaseModel):
@@ -163,37 +163,13 @@ def covariance(fits: Fits, settings: DecisionSettings) -> NDArray[np.float64]:
 
 @kernel
 def _covariances(hessians, residuals, least, alike, floor):  # type: ignore[no-untyped-def]
-    """Inverse of each scaled Hessian plus a floor, symmetric by construction."""
-    out = np.empty(hessians.shape)
+    """Inverse of each scaled Hessian plus a floor."""
+    information = np.empty(hessians.shape)
     for k in range(len(hessians)):
-        h = hessians[k] / (max(residuals[k], least) * alike)
-        a, b, c = h[0, 0] + floor, h[0, 1], h[0, 2]
-        d, e, f = h[1, 1] + floor, h[1, 2], h[2, 2] + floor
-        p, q, r = d * f - e * e, c * e - b * f, b * e - c * d
-        s, t, u = a * f - c * c, b * c - a * e, a * d - b * b
-        determinant = a * p + b * q + c * r
-        out[k, 0, 0], out[k, 1, 1], out[k, 2, 2] = p, s, u
-        out[k, 0, 1] = out[k, 1, 0] = q
-        out[k, 0, 2] = out[k, 2, 0] = r
-        out[k, 1, 2] = out[k, 2, 1] = t
-        out[k] /= determinant
-    return out
-
-
-def held(covariance: NDArray[np.float64]) -> float:
-    """Return how likely a pose of (3, 3) covariance is to be within 0.5 m and 10 degrees.
-
-    Position along the two axes of its ellipse, and heading, taken as independent.
-    """
-    (a, b), (_, d) = covariance[:2, :2].tolist()
-    mean, spread = 0.5 * (a + d), math.hypot(0.5 * (a - d), b)
-    variances = (mean + spread, max(mean - spread, 0.0), float(covariance[2, 2]))
-    limits = (_CORRECT_POSITION, _CORRECT_POSITION, _CORRECT_HEADING)
-    share = 1.0
-    for variance, limit in zip(variances, limits, strict=True):
-        if variance > 0.0:
-            share *= math.erf(limit / math.sqrt(2.0 * variance))
-    return share
+        information[k] = hessians[k] / (max(residuals[k], least) * alike)
+        for axis in range(3):
+            information[k, axis, axis] += floor
+    return inverses(information)
 
 
 def decide(fits: Fits, anchors: int, settings: DecisionSettings) -> Decision:

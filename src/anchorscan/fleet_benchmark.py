@@ -25,7 +25,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .building import random_building
-from .decision import DecisionSettings, covariance, evidence, held
+from .covariance import held
+from .decision import DecisionSettings, covariance, evidence
 from .description import Description, describe
 from .errors import AnchorscanError
 from .fleet import LOOK_ALIKES, TWINS, BuildingFits, Fleet, decide_over, no_twin, ranked, search

@@ -35,7 +35,7 @@ from .belief import (
     tidied,
     weighed,
 )
-from .decision import held
+from .covariance import held
 from .hypothesis import Hypothesis
 from .matcher import _ROOM, Candidates, Matcher, Trace
 from .motion import Motion, Odometer

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ._jit import kernel
-from .decision import held
+from .covariance import held
 from .hypothesis import Hypothesis
 from .localizer import Belief
 from .occupancy import OccupancyGrid, stitch
