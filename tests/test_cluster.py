@@ -12,11 +12,23 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 from as_a_user import run, write_log
 
-from anchorscan import AnchorscanError, LogError, benchmark, drive, random_building
+from anchorscan import (
+    AnchorscanError,
+    BuildingHypothesis,
+    Fleet,
+    LaserScan,
+    LogError,
+    ReferenceSet,
+    benchmark,
+    drive,
+    random_building,
+)
 from anchorscan.cluster import Spread, cluster
+from anchorscan.spread_fleet import SpreadFleet
 
 ITEMS = list(range(12))
 
@@ -99,6 +111,57 @@ def test_bench_answers_the_same_on_a_cluster(two_workers: Spread, tmp_path: Path
     assert here == there
     assert len(here[0]) > 2
     assert "bad.log" in here[1][0]
+
+
+def test_sets_held_by_workers_answer_as_in_one_process_whoever_dies(
+    two_workers: Spread, tmp_path: Path
+) -> None:
+    scans = []
+    for seed in (11, 12, 13):
+        building = random_building(seed, length=24.0, depth=14.0)
+        ReferenceSet.build(drive(building, seed=seed, length=20.0)).save(tmp_path / f"{seed}.apr")
+        scans += [r.scan for r in drive(building, seed=seed, length=8.0)[:24] if r.scan is not None]
+    scans.insert(3, LaserScan(np.empty(0, np.float32), 0.0, 1.0))
+    together = Fleet.open([tmp_path])
+    expected = [list(map(_place, together.locate(scan))) for scan in scans]
+    assert expected[3] == []
+    alone = SpreadFleet([tmp_path], Spread())
+    assert [list(map(_place, found)) for found in alone.locate_all(scans)] == expected
+    spread = SpreadFleet([tmp_path], two_workers)
+    assert len(spread) == 3
+    answers = spread.locate_all(scans)
+    found = [next(answers)]
+    ((first, _),) = two_workers.ask(_process, two_workers.hold(str, "ab"), [0])
+    os.kill(first, signal.SIGKILL)
+    found += answers
+    assert [list(map(_place, each)) for each in found] == expected
+
+
+def _place(found: BuildingHypothesis) -> object:
+    each = found.hypothesis
+    seen = (each.reference, each.pose, each.probability, each.accepted, each.evaluation)
+    return found.building, seen, each.covariance.tolist()
+
+
+def _process(_: str, __: int) -> int:
+    return os.getpid()
+
+
+def _ended(_: str, __: int) -> None:
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def test_a_question_that_ends_workers_is_a_known_error(two_workers: Spread) -> None:
+    with pytest.raises(AnchorscanError, match="several workers died"):
+        list(two_workers.ask(_ended, two_workers.hold(str, "a"), [0]))
+
+
+def test_what_cannot_be_held_is_a_known_error(two_workers: Spread, tmp_path: Path) -> None:
+    for spread in (Spread(), two_workers):
+        with pytest.raises(AnchorscanError, match=r"five\.log"):
+            spread.hold(squared, ITEMS)
+        with pytest.raises(AnchorscanError, match=r"none\.apr"):
+            SpreadFleet([tmp_path / "none.apr"], spread)
 
 
 def _timeless(answer: benchmark.Answer) -> object:

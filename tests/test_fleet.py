@@ -77,7 +77,7 @@ def test_a_fleet_of_one_set_answers_as_the_set(
             assert np.array_equal(one.hypothesis.covariance, other.covariance)
 
 
-def test_neither_order_nor_threads_nor_parts_change_an_answer(
+def test_neither_order_nor_parts_change_an_answer(
     sets: dict[str, ReferenceSet], drives: dict[str, list[Record]]
 ) -> None:
     fleet, backwards = Fleet(sets), Fleet(dict(reversed(sets.items())))
@@ -88,7 +88,6 @@ def test_neither_order_nor_threads_nor_parts_change_an_answer(
         parts = [part for each in reversed(sets.items()) for part in search([each], description)]
         answers = [
             fleet.locate(scan),
-            fleet.locate(scan, threads=2),
             backwards.locate(scan),
         ]
         shown = [

@@ -36,6 +36,7 @@ ORDER = (
         "reference_set",
         "set_check",
         "fleet",
+        "spread_fleet",
         "window",
     ),
     *("localizer", "topological_localizer"),

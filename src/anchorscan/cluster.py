@@ -3,7 +3,8 @@
 A piece is a function of a module of this package and one plain value.  Without a cluster pieces
 are done one after the other, here; with one, Dask (``dask.distributed``) hands them to its workers,
 does a piece again whose worker has died, and the results come back in the order of the pieces.
-So the outcome is the same, whoever did the work.
+So the outcome is the same, whoever did the work.  What takes long to make and is asked often stays
+with a worker, as an actor of Dask, whose work no other worker may steal.
 
 Workers run whatever a scheduler sends them: a scheduler belongs into a network that is trusted.
 """
@@ -11,7 +12,7 @@ Workers run whatever a scheduler sends them: a scheduler belongs into a network 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
@@ -19,13 +20,16 @@ from typing import Any, Generic, TypeVar
 
 from .errors import AnchorscanError, MissingExtraError
 
-__all__ = ["Done", "Spread", "cluster"]
+__all__ = ["Done", "Holder", "Spread", "cluster"]
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
+Held = TypeVar("Held")
 
 # Pieces that may wait for a worker; more would only fill memory.
 _AHEAD = 4
+# Of workers that were asked the same, until the question is to blame.
+_DEATHS = 3
 _PATIENCE = 30
 
 
@@ -84,6 +88,129 @@ class Spread:
         while waiting:
             yield _result(*waiting.popleft())
 
+    def hold(self, make: Callable[[Item], Held], items: Iterable[Item]) -> list[Holder[Held]]:
+        """Make values that stay with who makes them, to be asked.
+
+        Args:
+            make: Of a module, so that other processes can find it.
+            items: What to make them from, plain values.
+
+        Returns:
+            For ``ask``, in the order of the items; shared evenly among the workers.
+
+        Raises:
+            AnchorscanError: The first known error that one of them ended with.
+        """
+        holders = [Holder(make, item, n, self._client) for n, item in enumerate(items)]
+        for holder in holders:
+            holder.answer(_nothing, None, holder.ask(_nothing, None))
+        return holders
+
+    def ask(
+        self,
+        function: Callable[[Held, Item], Result],
+        holders: Sequence[Holder[Held]],
+        questions: Iterable[Item],
+    ) -> Iterator[list[Result]]:
+        """Ask all that is held the same questions.
+
+        Args:
+            function: Of a module; of what is held and a question.
+            holders: Given by ``hold``.
+            questions: Plain values.
+
+        Yields:
+            For each question the answers, in the order of the holders.
+
+        Raises:
+            AnchorscanError: A known error that an answer ended with, or the same question ended
+                several workers.
+        """
+        waiting: deque[tuple[Item, list[tuple[Any, Any]]]] = deque()
+        for question in questions:
+            waiting.append((question, [each.ask(function, question) for each in holders]))
+            if self._client is None or len(waiting) >= _AHEAD:
+                yield _answers(function, holders, *waiting.popleft())
+        while waiting:
+            yield _answers(function, holders, *waiting.popleft())
+
+
+class Holder(Generic[Held]):
+    """What a worker holds, made anew by another one when that worker has died.
+
+    Args:
+        make: Of a module.
+        item: What to make it from.
+        number: Which of the workers begins.
+        client: Of Dask; None holds it here.
+    """
+
+    def __init__(self, make: Callable[[Any], Held], item: object, number: int, client: Any) -> None:
+        self._recipe = (make, item)
+        self._number = number
+        self._client = client
+        self._made: Any = None
+        self._make()
+
+    def ask(self, function: Callable[[Held, Any], Any], question: object) -> tuple[Any, Any]:
+        """Put a question; ``answer`` waits for what this returns."""
+        if self._client is None:
+            return self._made, None
+        try:
+            return self._made, self._made.result().ask(function, question)
+        except (OSError, RuntimeError) as error:
+            return self._made, error
+
+    def answer(
+        self, function: Callable[[Held, Any], Any], question: object, asked: tuple[Any, Any]
+    ) -> Any:
+        """Give the answer, of another worker if the one that was asked has died.
+
+        Raises:
+            AnchorscanError: A known error of the answer, or several workers died.
+        """
+        made, answer = asked
+        if self._client is None:
+            return _value(made.ask(function, question))
+        for _ in range(_DEATHS):
+            try:
+                if isinstance(answer, Exception):
+                    raise answer
+                return _value(answer.result())
+            except (OSError, RuntimeError) as error:
+                died = error
+            if made is self._made:
+                self._make()
+            made, answer = self.ask(function, question)
+        raise AnchorscanError(f"several workers died of the same question: {died}") from died
+
+    def _make(self) -> None:
+        if self._client is None:
+            self._made = _Held(*self._recipe)
+            return
+        workers = sorted(self._client.scheduler_info(-1)["workers"])
+        first = workers[self._number % max(len(workers), 1) :][:1]  # none: whichever comes
+        self._made = self._client.submit(
+            _Held,
+            *self._recipe,
+            actor=True,
+            pure=False,
+            workers=first or None,
+            allow_other_workers=bool(first),
+        )
+
+
+class _Held(Generic[Held]):
+    """A value at its worker."""
+
+    def __init__(self, make: Callable[[Any], Held], item: object) -> None:
+        self._made = _done(make, item)
+
+    def ask(self, function: Callable[[Held, Any], Any], question: object) -> Done[Any, Any]:
+        if self._made.value is None:
+            return Done(question, None, self._made.error)
+        return _done(partial(function, self._made.value), question)
+
 
 @contextmanager
 def cluster(scheduler: str | None = None, workers: int | None = None) -> Iterator[Spread]:
@@ -136,6 +263,25 @@ def _done(function: Callable[[Item], Result], item: Item) -> Done[Item, Result]:
         return Done(item, function(item))
     except AnchorscanError as error:
         return Done(item, None, AnchorscanError(str(error)))
+
+
+def _nothing(_: object, __: None) -> None:
+    """Ask for nothing, to see whether it could be made."""
+
+
+def _value(done: Done[Any, Any]) -> Any:
+    if done.error is not None:
+        raise done.error
+    return done.value
+
+
+def _answers(
+    function: Callable[[Any, Any], Any],
+    holders: Sequence[Holder[Any]],
+    question: object,
+    asked: Sequence[tuple[Any, Any]],
+) -> list[Any]:
+    return [each.answer(function, question, one) for each, one in zip(holders, asked, strict=True)]
 
 
 def _result(item: Item, future: Any) -> Done[Item, Result]:

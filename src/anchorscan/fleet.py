@@ -22,8 +22,8 @@ probability is held to at most
 
 and what is held back goes to that rival.
 
-A part of the sets can be searched elsewhere, by a thread or by another machine: ``search`` gives
-values, and ``decide_over`` joins them, in any order of the parts, to the same answer.
+A part of the sets can be searched elsewhere (``spread_fleet.py``): ``search`` gives values, and
+``decide_over`` joins them, in any order of the parts, to the same answer.
 
 The scan is described once for all sets, and references are named for the few fits that are left
 of all sets together: done for each set, both took as long as the searches themselves.
@@ -34,7 +34,6 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
@@ -168,13 +167,12 @@ class Fleet:
                 none.
             SettingsError: Two sets have different settings.
         """
-        sets: dict[str, ReferenceSet] = {}
-        for path in set_files(paths):
-            name = path.name.removesuffix(_SUFFIX)
-            if name in sets:
-                raise ReferenceSetError(f"{path}: there is another set with the name {name}")
-            sets[name] = ReferenceSet.open(path, settings=settings)
-        return cls(sets)
+        return cls(
+            {
+                name: ReferenceSet.open(path, settings=settings)
+                for name, path in set_files(paths).items()
+            }
+        )
 
     def __len__(self) -> int:
         return len(self._sets)
@@ -191,34 +189,28 @@ class Fleet:
                 places.prepare()
             places.nearest(np.zeros((1, 3)))  # derives the index of this set
 
-    def locate(self, scan: LaserScan, threads: int = 1) -> list[BuildingHypothesis]:
+    def locate(self, scan: LaserScan) -> list[BuildingHypothesis]:
         """Find in which building, and where in it, a scan may have been taken.
 
         Args:
             scan: From any sensor, in the frame of its laser.
-            threads: How many threads share the sets.
 
         Returns:
             Hypotheses of all buildings, best first; none only for an unusable scan or from
             empty sets.
         """
         description = describe(scan, self.settings)
-        items = list(self._sets.items())
-        if threads <= 1:
-            found = list(search(items, description))
-        else:
-            with ThreadPoolExecutor(threads) as pool:
-                parts = pool.map(
-                    lambda part: list(search(part, description)), _shares(items, threads)
-                )
-                found = list(chain.from_iterable(parts))
+        found = list(search(self._sets.items(), description))
         places = decide_over(found, len(self), self.settings.decision)
-        return list(chain.from_iterable(self._named(place, description) for place in places))
+        return list(chain.from_iterable(self.named(place, description) for place in places))
 
-    def _named(
-        self, place: BuildingPlace, description: Description
-    ) -> Iterator[BuildingHypothesis]:
-        """Name the reference of a place; nothing, if its set has lost all of them meanwhile."""
+    def named(self, place: BuildingPlace, description: Description) -> Iterator[BuildingHypothesis]:
+        """Name the reference of a place; nothing, if its set has lost all of them meanwhile.
+
+        Args:
+            place: In one of the sets.
+            description: Of the scan, with the settings of the sets.
+        """
         worth = np.array([place.probability])
         decision = Decision(worth, 1.0 - place.probability, place.accepted)
         for found in self._sets[place.building].hypotheses(description, place.fit, decision):
@@ -310,21 +302,22 @@ def ranked(found: Sequence[BuildingFits]) -> tuple[list[tuple[BuildingFits, int]
     return best, _joined([each.fits[n : n + 1] for each, n in best])
 
 
-def set_files(paths: Iterable[str | os.PathLike[str]]) -> list[Path]:
-    """Name the files of sets; of a folder, all that end in ``.apr``.
+def set_files(paths: Iterable[str | os.PathLike[str]]) -> dict[str, Path]:
+    """Return the files of sets by their names; of a folder, all that end in ``.apr``.
 
     Raises:
-        ReferenceSetError: A folder has none.
+        ReferenceSetError: A folder has none, or two have the same name.
     """
-    files: list[Path] = []
+    files: dict[str, Path] = {}
     for path in map(Path, paths):
-        if path.is_dir():
-            within = sorted(path.glob(f"*{_SUFFIX}"))
-            if not within:
-                raise ReferenceSetError(f"{path}: has no set: no file that ends in {_SUFFIX}")
-            files += within
-        else:
-            files.append(path)
+        within = sorted(path.glob(f"*{_SUFFIX}")) if path.is_dir() else [path]
+        if not within:
+            raise ReferenceSetError(f"{path}: has no set: no file that ends in {_SUFFIX}")
+        for file in within:
+            name = file.name.removesuffix(_SUFFIX)
+            if name in files:
+                raise ReferenceSetError(f"{file}: there is another set with the name {name}")
+            files[name] = file
     return files
 
 
@@ -336,10 +329,3 @@ def _joined(parts: Sequence[Fits]) -> Fits:
         np.concatenate([part.residuals for part in parts]),
         parts[0].readings,
     )
-
-
-def _shares(
-    items: Sequence[tuple[str, ReferenceSet]], count: int
-) -> list[Sequence[tuple[str, ReferenceSet]]]:
-    """Deal items out, so that large and small sets mix."""
-    return [items[start::count] for start in range(min(count, len(items)))]

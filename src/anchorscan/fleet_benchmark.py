@@ -197,18 +197,17 @@ def together(folder: Path, scans: Sequence[LaserScan], settings: Settings) -> It
         f"{len(fleet)} sets opened in {opened:.1f} s and prepared in {prepared:.1f} s; they take "
         f"{own:.0f} MB of memory and {mapped:.0f} MB of mapped files"
     )
-    for threads in (1, 2):
-        spent, used = [], time.process_time()
-        for scan in scans:
-            start = time.perf_counter()
-            fleet.locate(scan, threads)
-            spent.append(time.perf_counter() - start)
-        used = (time.process_time() - used) / len(scans)
-        middle, late = (1e3 * float(np.percentile(spent, q)) for q in (50, 99))
-        yield (
-            f"a query by {threads} threads: median {middle:.0f} ms, 99 % {late:.0f} ms, "
-            f"{1e3 * used:.0f} ms of processor time"
-        )
+    spent, used = [], time.process_time()
+    for scan in scans:
+        start = time.perf_counter()
+        fleet.locate(scan)
+        spent.append(time.perf_counter() - start)
+    used = (time.process_time() - used) / len(scans)
+    middle, late = (1e3 * float(np.percentile(spent, q)) for q in (50, 99))
+    yield (
+        f"a query: median {middle:.0f} ms, 99 % {late:.0f} ms, "
+        f"{1e3 * used:.0f} ms of processor time"
+    )
 
 
 def _keep(path: Path, places: ReferenceSet, settings: Settings) -> None:

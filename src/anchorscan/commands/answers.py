@@ -6,7 +6,7 @@ import signal
 import time
 from collections import deque
 from collections.abc import Iterable, Iterator
-from itertools import islice
+from itertools import islice, tee
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -23,16 +23,17 @@ from .options import (
     ProcessesOption,
     SetArgument,
     SettingsOptions,
+    SharingOptions,
 )
 
 if TYPE_CHECKING:
-    from ..fleet import Fleet
     from ..hypothesis import Hypothesis
     from ..io import Log
     from ..pose import Pose2D
     from ..record import Record
     from ..reference_set import ReferenceSet
     from ..settings import Settings
+    from ..spread_fleet import SpreadFleet
 
 __all__ = ["locate", "track", "which"]
 
@@ -81,35 +82,35 @@ def which(
         ),
     ],
     output: LinesOption = None,
-    threads: Annotated[
-        int, typer.Option(min=1, metavar="N", help="Share the sets among threads.")
-    ] = 1,
     *,
     reading: LogOptions,
     settings: SettingsOptions,
+    sharing: SharingOptions,
 ) -> None:
     """Say in which of many buildings every scan of a log was taken, and where in it.
 
     One JSON object a scan, as of locate; every hypothesis names its building: the file of its set
     without ".apr". A probability is that the building and the pose are right, among all sets.
+
+    Workers, if there are any, share the sets: each holds a part of them.
     """
-    from ..fleet import Fleet
+    from ..spread_fleet import SpreadFleet
 
     *places, log = sets
     if not places:
         raise typer.BadParameter("give reference sets, and a log after them")
     opened = reading.open(log)
-    fleet = Fleet.open(places, settings=settings.read())
-    fleet.prepare()
+    chosen = settings.read()
     records = records_shown(opened, "asking", output)
     accepted: dict[str, int] = {}
     count = 0
-    lines = (_which_line(fleet, record, threads) for record in records)
-    for line in write_lines(lines, output):
-        count += 1
-        if line["accepted"]:
-            building = line["hypotheses"][0]["building"]
-            accepted[building] = accepted.get(building, 0) + 1
+    with sharing.cluster() as spread:
+        fleet = SpreadFleet(places, spread, chosen)
+        for line in write_lines(_which_lines(fleet, records), output):
+            count += 1
+            if line["accepted"]:
+                building = line["hypotheses"][0]["building"]
+                accepted[building] = accepted.get(building, 0) + 1
     told = ", ".join(f"{number} in {name}" for name, number in sorted(accepted.items()))
     say(f"{log}: {count} scans, {len(fleet)} sets: {told or 'none located'}")
 
@@ -245,22 +246,30 @@ def _work(records: list[Record]) -> list[dict[str, Any]]:
     return [_worker.line(record) for record in records]
 
 
-def _which_line(fleet: Fleet, record: Record, threads: int) -> dict[str, Any]:
-    """Return the line of ``which`` for a record."""
+def _which_lines(fleet: SpreadFleet, records: Iterable[Record]) -> Iterator[dict[str, Any]]:
+    """Yield the line of ``which`` for every record; its time is that since the one before."""
+    import numpy as np
+
+    from ..scan import LaserScan
+
+    nothing = LaserScan(np.empty(0, np.float32), 0.0, 1.0)
+    kept, asked = tee(records)
     start = time.perf_counter()
-    found = [] if record.scan is None else fleet.locate(record.scan, threads)
-    line: dict[str, Any] = {
-        "scan": record.index,
-        "stamp": record.stamp,
-        "seconds": round(time.perf_counter() - start, _DECIMALS + 1),
-        "accepted": bool(found) and found[0].hypothesis.accepted,
-        "hypotheses": [
-            {"building": each.building, **_hypothesis_line(each.hypothesis)} for each in found
-        ],
-    }
-    if not found:
-        line["reason"] = record.problem or "no reading is a return"
-    return line
+    scans = (record.scan or nothing for record in asked)
+    for record, found in zip(kept, fleet.locate_all(scans), strict=True):
+        line: dict[str, Any] = {
+            "scan": record.index,
+            "stamp": record.stamp,
+            "seconds": round(time.perf_counter() - start, _DECIMALS + 1),
+            "accepted": bool(found) and found[0].hypothesis.accepted,
+            "hypotheses": [
+                {"building": each.building, **_hypothesis_line(each.hypothesis)} for each in found
+            ],
+        }
+        if not found:
+            line["reason"] = record.problem or "no reading is a return"
+        yield line
+        start = time.perf_counter()
 
 
 def _tracked(
