@@ -13,7 +13,14 @@ from scans import FULL_TURN, WIDE, building, seeds, small_room
 
 from anchorscan import Pose2D, Settings, simulate
 from anchorscan.angle_function import AngleFunctionSettings, angle_function
-from anchorscan.field import LikelihoodField, cell_code, field_scores, passed_through, refined
+from anchorscan.field import (
+    LikelihoodField,
+    cell_code,
+    field_scores,
+    passed_through,
+    refined,
+    room_for,
+)
 from anchorscan.proposal import spread
 from anchorscan.segments import is_small
 from anchorscan.verification import (
@@ -127,7 +134,10 @@ def plain_verify(poses, points, tiles, limits):
     fits = []
     for k in apart:
         pose = refined(
-            np.array(best[k]), spread(points, limits.fit_readings), tiles, limits.iterations
+            np.array(best[k]),
+            room_for(spread(points, limits.fit_readings)),
+            tiles,
+            limits.iterations,
         )
         numbers = plain_features(pose, spread(points, limits.last_readings), tiles)
         rays = spread(points, limits.rays)

@@ -72,6 +72,7 @@ _CENTRES = np.arange(_BLOCK, dtype=np.float32) + np.float32(0.5)
 _LONGEST_RAY = 100.0
 # Hit positions are summed in 256ths of a cell, so that sums stay integers.
 _FRACTIONS = 256
+_CODE = np.uint8(_FAR)
 _1, _4, _6, _8, _12 = (np.uint64(value) for value in (1, 4, 6, 8, 12))
 _15, _63, _64 = (np.uint64(value) for value in (15, 63, 64))
 
@@ -699,29 +700,79 @@ def coarse_score(tiles, cx, cy):  # type: ignore[no-untyped-def]
 
 
 @kernel
+def room_for(readings):  # type: ignore[no-untyped-def]
+    """Columns of (N, 2) or more readings, and room to look all of them up at once."""
+    count = len(readings)
+    across, up = readings[:, 0].copy(), readings[:, 1].copy()
+    places = np.empty((3, count), np.int32)
+    return across, up, places, np.empty((4, count), np.uint8), np.empty((8, count))
+
+
+@inlined
+def _placed(cx, cy, tiles, places, i):  # type: ignore[no-untyped-def]
+    """Note where to look a cell up: its page, its square there and its place in that one's tile."""
+    # In 32 bits throughout: a processor has no instruction that does several of 64 bits.
+    u = min(max(cx, np.int32(0)), np.int32((tiles.width << 12) - 1))
+    v = min(max(cy, np.int32(0)), np.int32((tiles.height << 12) - 1))
+    places[0, i] = (v >> 12) * np.int32(tiles.width) + (u >> 12)
+    places[1, i] = ((v >> 6) & 63) << 6 | ((u >> 6) & 63)
+    places[2, i] = (v & 63) << 6 | (u & 63)
+
+
+@inlined
+def _index(tiles, places, i):  # type: ignore[no-untyped-def]
+    """Index of the code of a cell of which ``_placed`` has noted where to look."""
+    page = np.uint64(tiles.pages[np.uint64(places[0, i])])
+    tile = np.uint64(tiles.table[(page << _12) | np.uint64(places[1, i])])
+    return (tile << _12) | np.uint64(places[2, i])
+
+
+@inlined
+def look_up(pose, room, tiles):  # type: ignore[no-untyped-def]
+    """Note the bytes of the cells in which readings end at a pose; return these notes.
+
+    Two loops, since a processor does several readings at once in the first.
+    """
+    across, up, places, notes, _ = room
+    scale = 1.0 / tiles.resolution
+    c, s = math.cos(pose[2]) * scale, math.sin(pose[2]) * scale
+    x = pose[0] * scale - tiles.column
+    y = pose[1] * scale - tiles.row
+    for i in range(len(across)):
+        cx = np.int32(x + c * across[i] - s * up[i])
+        cy = np.int32(y + s * across[i] + c * up[i])
+        _placed(cx, cy, tiles, places, i)
+    codes = notes[0]
+    for i in range(len(across)):
+        codes[i] = tiles.codes[_index(tiles, places, i)]
+    return codes
+
+
+@kernel
 def field_scores(poses, readings, tiles, weights):  # type: ignore[no-untyped-def]
     """(P,) score of readings (scan frame) at each of (P, 3) poses.
 
     Readings are (N, 3): x, y and 1 for those on small things.
     """
     scores = np.empty(len(poses))
-    scale = 1.0 / tiles.resolution
+    room = room_for(readings)
+    small = np.flatnonzero(readings[:, 2] > 0.0)
     for p in range(len(poses)):
-        c = math.cos(poses[p, 2]) * scale
-        s = math.sin(poses[p, 2]) * scale
-        x = poses[p, 0] * scale - tiles.column
-        y = poses[p, 1] * scale - tiles.row
-        total, held_against, new = 0.0, 0.0, 0
-        for i in range(len(readings)):
-            cx = int(x + c * readings[i, 0] - s * readings[i, 1])
-            cy = int(y + s * readings[i, 0] + c * readings[i, 1])
-            code = cell_code(tiles, cx, cy)
-            total += weights.scores[code]
-            if readings[i, 2] > 0.0 and weights.is_new[code]:
-                held_against += weights.scores[code]
-                new += 1
-        scores[p] = better_score(total, len(readings), held_against, new, weights)
+        scores[p] = score_of(look_up(poses[p], room, tiles), small, weights)
     return scores
+
+
+@inlined
+def score_of(codes, small, weights):  # type: ignore[no-untyped-def]
+    """Score of readings that end in cells of such codes; ``small`` ones are on small things."""
+    total, held_against, new = 0.0, 0.0, 0
+    for code in codes:
+        total += weights.scores[code]
+    for i in small:
+        if weights.is_new[codes[i]]:
+            held_against += weights.scores[codes[i]]
+            new += 1
+    return better_score(total, len(codes), held_against, new, weights)
 
 
 @kernel
@@ -744,53 +795,76 @@ def better_score(total, count, held_against, new, weights):  # type: ignore[no-u
 
 
 @inlined
-def _distance_at(tiles, gx, gy):  # type: ignore[no-untyped-def]
-    """Distance to the nearest surface and its gradient, bilinear; in metres, cells in."""
-    ix, iy = int(gx - 0.5), int(gy - 0.5)
-    fx, fy = gx - 0.5 - ix, gy - 0.5 - iy
+def _corners(pose, room, tiles):  # type: ignore[no-untyped-def]
+    """For each reading the arm from the pose, the place in a square of four cells, their codes.
+
+    Two loops, as in ``look_up``.
+    """
+    across, up, places, codes, numbers = room
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    for i in range(len(across)):
+        rx, ry = c * across[i] - s * up[i], s * across[i] + c * up[i]
+        gx = (pose[0] + rx) / tiles.resolution - tiles.column - 0.5
+        gy = (pose[1] + ry) / tiles.resolution - tiles.row - 0.5
+        cx, cy = np.int32(gx), np.int32(gy)
+        numbers[0, i], numbers[1, i] = rx, ry
+        numbers[2, i], numbers[3, i] = gx - cx, gy - cy
+        _placed(cx, cy, tiles, places, i)
+    for i in range(len(across)):
+        at = _index(tiles, places, i)
+        place = places[2, i]
+        codes[0, i] = tiles.codes[at]
+        if place & 63 != 63 and place >> 6 != 63:
+            # All four cells lie in one tile, as they do for 97 readings of 100.
+            codes[1, i] = tiles.codes[at + _1]
+            codes[2, i] = tiles.codes[at + _64]
+            codes[3, i] = tiles.codes[at + _64 + _1]
+        else:
+            v, u = place >> 6, place & 63
+            v += (places[0, i] // tiles.width << 12) + (places[1, i] >> 6 << 6)
+            u += (places[0, i] % tiles.width << 12) + ((places[1, i] & 63) << 6)
+            codes[1, i] = cell_code(tiles, u + 1, v)
+            codes[2, i] = cell_code(tiles, u, v + 1)
+            codes[3, i] = cell_code(tiles, u + 1, v + 1)
+
+
+@inlined
+def _gradients(room, tiles, scale):  # type: ignore[no-untyped-def]
+    """Distance to the nearest surface and its gradient at each reading, and its weight.
+
+    Bilinear, in metres; the gradient is by x, y and the turn of the pose.  The weights are those
+    of Geman and McClure, and zero where no surface is near.
+    """
+    _, _, _, codes, numbers = room
     unit = tiles.reach / _FAR
-    u = np.uint64(min(max(ix, 0), (tiles.width << 12) - 1))
-    v = np.uint64(min(max(iy, 0), (tiles.height << 12) - 1))
-    if (u & _63) != _63 and (v & _63) != _63:
-        # All four cells lie in one tile, as they do for 97 readings of 100.
-        at = (_tile_at(tiles, u >> _6, v >> _6) << _12) | ((v & _63) << _6) | (u & _63)
-        a = (tiles.codes[at] & _FAR) * unit
-        b = (tiles.codes[at + _1] & _FAR) * unit
-        c = (tiles.codes[at + _64] & _FAR) * unit
-        d = (tiles.codes[at + _64 + _1] & _FAR) * unit
-    else:
-        a = (cell_code(tiles, ix, iy) & _FAR) * unit
-        b = (cell_code(tiles, ix + 1, iy) & _FAR) * unit
-        c = (cell_code(tiles, ix, iy + 1) & _FAR) * unit
-        d = (cell_code(tiles, ix + 1, iy + 1) & _FAR) * unit
-    value = (a * (1.0 - fx) + b * fx) * (1.0 - fy) + (c * (1.0 - fx) + d * fx) * fy
-    dx = ((b - a) * (1.0 - fy) + (d - c) * fy) / tiles.resolution
-    dy = ((c - a) * (1.0 - fx) + (d - b) * fx) / tiles.resolution
-    return value, dx, dy
+    for i in range(len(codes[0])):
+        fx, fy = numbers[2, i], numbers[3, i]
+        a, b = (codes[0, i] & _CODE) * unit, (codes[1, i] & _CODE) * unit
+        c, d = (codes[2, i] & _CODE) * unit, (codes[3, i] & _CODE) * unit
+        value = (a * (1.0 - fx) + b * fx) * (1.0 - fy) + (c * (1.0 - fx) + d * fx) * fy
+        dx = ((b - a) * (1.0 - fy) + (d - c) * fy) / tiles.resolution
+        dy = ((c - a) * (1.0 - fx) + (d - b) * fx) / tiles.resolution
+        weight = 1.0 / (1.0 + (value / scale) ** 2)
+        numbers[4, i], numbers[5, i], numbers[6, i] = value, dx, dy
+        numbers[7, i] = weight * weight if value < 0.9 * tiles.reach else 0.0
 
 
 @kernel
-def normal_equations(pose, points, tiles, scale):  # type: ignore[no-untyped-def]
+def normal_equations(pose, room, tiles, scale):  # type: ignore[no-untyped-def]
     """Gauss-Newton terms of the robust distances of points to surfaces.
 
     Returns the upper triangle of the Hessian, row by row, the gradient, the weighted sum of
     squared distances and the sum of weights (Geman-McClure weights of the given scale).
     """
+    _corners(pose, room, tiles)
+    _gradients(room, tiles, scale)
+    numbers = room[4]
     xx, xy, xt, yy, yt, tt = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     x, y, t = 0.0, 0.0, 0.0
     squares, total = 0.0, 0.0
-    c, s = math.cos(pose[2]), math.sin(pose[2])
-    for i in range(len(points)):
-        rx = c * points[i, 0] - s * points[i, 1]
-        ry = s * points[i, 0] + c * points[i, 1]
-        gx = (pose[0] + rx) / tiles.resolution - tiles.column
-        gy = (pose[1] + ry) / tiles.resolution - tiles.row
-        value, dx, dy = _distance_at(tiles, gx, gy)
-        if value >= 0.9 * tiles.reach:
-            continue
-        weight = 1.0 / (1.0 + (value / scale) ** 2)
-        weight *= weight
-        dt = dy * rx - dx * ry
+    for i in range(numbers.shape[1]):
+        value, dx, dy, weight = numbers[4, i], numbers[5, i], numbers[6, i], numbers[7, i]
+        dt = dy * numbers[0, i] - dx * numbers[1, i]
         x += weight * dx * value
         y += weight * dy * value
         t += weight * dt * value
@@ -829,13 +903,13 @@ def _solved(h, g, damping):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def refined(pose, points, tiles, iterations):  # type: ignore[no-untyped-def]
+def refined(pose, room, tiles, iterations):  # type: ignore[no-untyped-def]
     """Move a (3,) pose so that points lie on surfaces: damped Gauss-Newton, bounded steps."""
     moved = pose.copy()
     for step in range(iterations):
         # From coarse to fine: wide weights first, so that the pose can still travel.
         scale = 0.2 if 2 * step < iterations else 0.1
-        hessian, gradient, _, _ = normal_equations(moved, points, tiles, scale)
+        hessian, gradient, _, _ = normal_equations(moved, room, tiles, scale)
         x, y, theta = _solved(hessian, gradient, 1.0)
         size = math.hypot(x, y)
         share = 1.0 if size < 0.1 else 0.1 / size
@@ -858,6 +932,7 @@ def passed_through(pose, points, tiles, margin):  # type: ignore[no-untyped-def]
     c, s = math.cos(pose[2]), math.sin(pose[2])
     x = pose[0] / tiles.resolution - tiles.column
     y = pose[1] / tiles.resolution - tiles.row
+    width, height = tiles.width << 12, tiles.height << 12
     clear = int(_CLEAR / tiles.reach * _FAR)
     shortly = math.floor(2.0 * _CLEAR / tiles.resolution)
     skipped = _skipped(clear, tiles)
@@ -869,8 +944,16 @@ def passed_through(pose, points, tiles, margin):  # type: ignore[no-untyped-def]
         last_clear, met = -shortly, -1.0
         last = math.floor((min(length, _LONGEST_RAY) - margin) / tiles.resolution) - 1.0
         k = 0.0
+        tile, tile_x, tile_y = np.uint64(0), -_SIDE, -_SIDE
         while k <= last:
-            code = cell_code(tiles, int(x + k * dx), int(y + k * dy))
+            cx, cy = int(x + k * dx), int(y + k * dy)
+            if ((cx ^ tile_x) | (cy ^ tile_y)) >> 6 != 0:
+                # Looked up anew only in another tile: each step has to wait for the one before.
+                tile_x, tile_y = cx, cy
+                u = np.uint64(min(max(cx, 0), width - 1))
+                v = np.uint64(min(max(cy, 0), height - 1))
+                tile = _tile_at(tiles, u >> _6, v >> _6) << _12
+            code = tiles.codes[tile | np.uint64((cy & 63) << 6 | (cx & 63))]
             if (code & _FAR) >= clear:
                 if met >= 0.0 and k - met <= shortly:
                     through += 1

@@ -35,13 +35,14 @@ from .field import (
     Tiles,
     Weights,
     _solved,
-    better_score,
-    cell_code,
     field_scores,
+    look_up,
     normal_equations,
     passed_through,
     put_hessian,
     refined,
+    room_for,
+    score_of,
 )
 from .proposal import spread
 from .segments import is_small
@@ -273,33 +274,21 @@ def _distinct(poses, distance, turn, most):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _features(pose, readings, tiles, weights, numbers):  # type: ignore[no-untyped-def]
+def _features(pose, room, small, tiles, weights, numbers):  # type: ignore[no-untyped-def]
     """The numbers of ``FEATURES`` for one pose, but for the rays."""
-    numbers[:] = 0.0
-    total, held_against, new = 0.0, 0.0, 0
-    c, s = math.cos(pose[2]) / tiles.resolution, math.sin(pose[2]) / tiles.resolution
-    x = pose[0] / tiles.resolution - tiles.column
-    y = pose[1] / tiles.resolution - tiles.row
-    for i in range(len(readings)):
-        code = cell_code(
-            tiles,
-            int(x + c * readings[i, 0] - s * readings[i, 1]),
-            int(y + s * readings[i, 0] + c * readings[i, 1]),
-        )
+    codes = look_up(pose, room, tiles)
+    near, close, free, unknown, off = 0, 0, 0, 0, 0
+    for code in codes:
         distance = (code & 63) * tiles.reach / 63.0
-        free = (code & 64) > 0
-        total += weights.scores[code]
-        if readings[i, 2] > 0.0 and weights.is_new[code]:
-            held_against += weights.scores[code]
-            new += 1
-        numbers[1] += distance <= 0.1
-        numbers[2] += distance <= 0.2
-        if distance >= tiles.reach:
-            numbers[3 if free else 4] += 1
-        elif distance > 0.2 and free:
-            numbers[6] += 1
-    numbers /= max(len(readings), 1)
-    numbers[0] = better_score(total, len(readings), held_against, new, weights)
+        is_free = (code & 64) > 0
+        near += distance <= 0.1
+        close += distance <= 0.2
+        free += distance >= tiles.reach and is_free
+        unknown += distance >= tiles.reach and not is_free
+        off += 0.2 < distance < tiles.reach and is_free
+    numbers[1], numbers[2], numbers[3], numbers[4], numbers[6] = near, close, free, unknown, off
+    numbers /= max(len(codes), 1)
+    numbers[0] = score_of(codes, small, weights)
 
 
 @kernel
@@ -307,15 +296,16 @@ def _fit(poses, readings, tiles, weights, steps, places, rays):  # type: ignore[
     """Refine every pose and take the numbers of each place, of the highest worth first."""
     count = len(poses)
     moved = np.empty((count, 3))
-    features = np.empty((count, 7))
+    features = np.zeros((count, 7))
     worths = np.empty(count)
-    few = spread(readings, steps[0])
+    few = room_for(spread(readings, steps[0]))
     many = spread(readings, steps[2])
+    small, many = np.flatnonzero(many[:, 2] > 0.0), room_for(many)
     followed = spread(readings, rays[0])
     for k in range(count):
         moved[k] = refined(poses[k], few, tiles, steps[1])
         moved[k, 2] = wrapped(moved[k, 2])
-        _features(moved[k], many, tiles, weights, features[k])
+        _features(moved[k], many, small, tiles, weights, features[k])
         features[k, 5] = passed_through(moved[k], followed, tiles, rays[1])
         worths[k] = worth(features[k, 0], features[k, 5])
     order = np.argsort(-worths, kind="mergesort")
@@ -335,15 +325,16 @@ def _follow(poses, stiffness, readings, tiles, weights, steps, rays):  # type: i
     """Refine every expected pose and take all its numbers."""
     count = len(poses)
     moved = np.empty((count, 3))
-    features = np.empty((count, 7))
+    features = np.zeros((count, 7))
     hessians = np.empty((count, 3, 3))
     residuals = np.empty(count)
-    few = spread(readings, steps[0])
+    few = room_for(spread(readings, steps[0]))
     many = spread(readings, steps[2])
+    small, many = np.flatnonzero(many[:, 2] > 0.0), room_for(many)
     followed = spread(readings, rays[0])
     for k in range(count):
         moved[k] = _held_back(poses[k], stiffness[k], few, tiles, steps[1])
-        _features(moved[k], many, tiles, weights, features[k])
+        _features(moved[k], many, small, tiles, weights, features[k])
         features[k, 5] = passed_through(moved[k], followed, tiles, rays[1])
         hessian, _, squares, total = normal_equations(moved[k], few, tiles, 0.1)
         put_hessian(hessian, hessians[k])
@@ -352,12 +343,12 @@ def _follow(poses, stiffness, readings, tiles, weights, steps, rays):  # type: i
 
 
 @kernel
-def _held_back(pose, k, points, tiles, iterations):  # type: ignore[no-untyped-def]
+def _held_back(pose, k, room, tiles, iterations):  # type: ignore[no-untyped-def]
     """Move a pose as `refined` does, drawn back to where it was by a stiffness ``k``."""
     moved = pose.copy()
     for step in range(iterations):
         scale = 0.2 if 2 * step < iterations else 0.1
-        hessian, gradient, _, _ = normal_equations(moved, points, tiles, scale)
+        hessian, gradient, _, _ = normal_equations(moved, room, tiles, scale)
         xx, xy, xt, yy, yt, tt = hessian
         hessian = (
             xx + k[0, 0],
