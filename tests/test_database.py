@@ -23,7 +23,7 @@ def graph_of(lengths):
     lengths = np.sort(np.asarray(lengths, dtype=np.float64))
     count = len(lengths)
     anchors = AnchorPoints(np.zeros((0, 2)), np.zeros(0, np.int64), np.zeros(0))
-    return AnchorGraph(anchors, np.zeros((count, 2), np.int32), lengths, np.zeros(count))
+    return AnchorGraph(anchors, np.zeros((count, 2), np.int32), lengths)
 
 
 def by_length(count_once=False):

@@ -31,6 +31,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -247,15 +248,9 @@ def jump_edge_anchors(
         angles.way,
         angles.surface,
         angles.moments,
-        surfaces.first,
-        surfaces.last,
-        (
-            settings.arm,
-            settings.shortest_arm,
-            settings.flatness,
-            settings.smallest_rim_angle,
-            angles.reach,
-        ),
+        (surfaces.first, surfaces.last),
+        anchor_limits(settings)[0],
+        angles.reach,
     )
     return rows
 
@@ -268,15 +263,8 @@ def angle_anchors(
         angles.points,
         angles.way,
         angles.moments,
-        surfaces.first,
-        surfaces.last,
-        (
-            settings.arm,
-            settings.shortest_arm,
-            settings.flatness,
-            settings.smallest_turn,
-            settings.farthest_corner,
-        ),
+        (surfaces.first, surfaces.last),
+        anchor_limits(settings)[1],
     )
     return rows
 
@@ -284,21 +272,10 @@ def angle_anchors(
 def virtual_edges(angles: AngleFunction, settings: AnchorSettings) -> list[VirtualEdges]:
     """Find the walls whose crossings are virtual edge anchors, one value per main angle."""
     found = []
-    for main in _main_angles(
-        angles.surface,
-        angles.extents,
-        settings.angle_function.bins,
-        settings.most_main_angles,
-        settings.smallest_main_share,
-    ):
+    _, _, main_limits, wall_limits = anchor_limits(settings)
+    for main in _main_angles(angles.surface, angles.extents, main_limits):
         histograms, origin, x_walls, y_walls = _virtual_edges(
-            angles.points,
-            angles.surface,
-            angles.extents,
-            main,
-            settings.wall_angle,
-            settings.facing,
-            (settings.histogram_bin, settings.smallest_wall, settings.most_walls),
+            angles.points, angles.surface, angles.extents, main, wall_limits
         )
         found.append(
             VirtualEdges(float(main), histograms, origin, settings.histogram_bin, x_walls, y_walls)
@@ -306,10 +283,49 @@ def virtual_edges(angles: AngleFunction, settings: AnchorSettings) -> list[Virtu
     return found
 
 
+def anchor_limits(settings: AnchorSettings) -> tuple[tuple[Any, ...], ...]:
+    """Return the settings that kernels need: of jump edges, angles, main angles and walls."""
+    arm = (settings.arm, settings.shortest_arm, settings.flatness)
+    return (
+        (*arm, settings.smallest_rim_angle),
+        (*arm, settings.smallest_turn, settings.farthest_corner),
+        (settings.angle_function.bins, settings.most_main_angles, settings.smallest_main_share),
+        (
+            settings.histogram_bin,
+            settings.smallest_wall,
+            settings.most_walls,
+            settings.wall_angle,
+            settings.facing,
+        ),
+    )
+
+
 @kernel
-def _jump_edges(points, gaps, way, surface, moments, first, last, limits):  # type: ignore[no-untyped-def]
+def all_anchors(angles, surfaces, limits, reach):  # type: ignore[no-untyped-def]
+    """Do what ``gather`` does in one go: positions, kinds, directions, and the main angle.
+
+    ``angles`` are the arrays of an ``AngleFunction``, ``surfaces`` those of ``Segments``.
+    """
+    points, _, _, gaps, _, way, surface, extents, moments = angles
+    rows = np.concatenate(
+        (
+            _jump_edges(points, gaps, way, surface, moments, surfaces, limits[0], reach),
+            _angle_anchors(points, way, moments, surfaces, limits[1]),
+        )
+    )
+    mains = _main_angles(surface, extents, limits[2])
+    for main in mains:
+        _, _, x_walls, y_walls = _virtual_edges(points, surface, extents, main, limits[3])
+        rows = np.concatenate((rows, _crossings(main, x_walls, y_walls)))
+    positions, kinds, directions = _columns(rows)
+    return positions, kinds, directions, mains[0] if len(mains) > 0 else np.nan
+
+
+@kernel
+def _jump_edges(points, gaps, way, surface, moments, surfaces, limits, reach):  # type: ignore[no-untyped-def]
     """Margins of large surfaces behind which the range jumps to far."""
-    arm, shortest, flatness, rim, reach = limits
+    arm, shortest, flatness, rim = limits
+    first, last = surfaces
     rows = np.empty((2 * len(first), 4))
     found = 0
     for s in range(len(first)):
@@ -365,13 +381,14 @@ def _distance_to_chord(x, y, a, b):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _angle_anchors(points, way, moments, first, last, limits):  # type: ignore[no-untyped-def]
+def _angle_anchors(points, way, moments, surfaces, limits):  # type: ignore[no-untyped-def]
     """Places within large surfaces where the surface angle changes.
 
     Every place between two readings may be one; the lines of the surfaces before and behind it
     are fitted to the readings up to the one and from the other on.
     """
     arm, shortest, flatness, smallest_turn, farthest = limits
+    first, last = surfaces
     straightest, sharpest = math.cos(smallest_turn), math.cos(0.95 * math.pi)
     rows = np.empty((len(points), 4))
     strength = np.empty(len(points))
@@ -427,8 +444,9 @@ def _angle_anchors(points, way, moments, first, last, limits):  # type: ignore[n
 
 
 @kernel
-def _main_angles(surface, weights, bins, most, share):  # type: ignore[no-untyped-def]
+def _main_angles(surface, weights, limits):  # type: ignore[no-untyped-def]
     """Main angles modulo 90 degrees, strongest first, each the mean direction at its peak."""
+    bins, most, share = limits
     half = bins // 2
     raw = np.zeros(half)
     quarter = 0.5 * math.pi
@@ -469,9 +487,9 @@ def _main_angles(surface, weights, bins, most, share):  # type: ignore[no-untype
 
 
 @kernel
-def _virtual_edges(points, surface, weights, main, wall_angle, facing, limits):  # type: ignore[no-untyped-def]
+def _virtual_edges(points, surface, weights, main, limits):  # type: ignore[no-untyped-def]
     """Histograms of one main angle, where they begin, and the walls over x and over y."""
-    width, smallest, most = limits
+    width, smallest, most, wall_angle, facing = limits
     histograms, origin = _wall_histograms(points, surface, weights, main, width, wall_angle, facing)
     peaks = (origin, width, smallest, most)
     x_walls = _walls(histograms[0], peaks, facing)

@@ -98,25 +98,38 @@ def angle_function(scan: LaserScan, settings: AngleFunctionSettings) -> AngleFun
     A scan of either sense of rotation and any field of view will do; the ends of a full
     turn are neighbours, and a second look at the same direction is dropped.
     """
-    step = abs(scan.angle_increment)
-    is_full_turn = scan.is_full_turn
-    points, ranges, beams, gaps, runs, way, surface, extents, moments = _angle_function(
-        scan.ranges,
-        (scan.angle_min, scan.angle_increment, scan.shortest_return, scan.longest_return),
-        scan.range_max,
-        round(2.0 * math.pi / step) if is_full_turn else 0,
-        (
-            settings.grazing_angle,
-            settings.noise,
-            settings.largest_gap,
-            settings.smallest_jump,
-        ),
-        settings.baseline,
-        settings.fitted,
-    )
     return AngleFunction(
-        points, ranges, beams, gaps, runs, way, surface, extents, moments, scan.range_max
+        *_angle_function(scan.ranges, sweep(scan), surface_limits(settings)), scan.range_max
     )
+
+
+def sweep(scan: LaserScan) -> tuple[float, float, float, float, float, int]:
+    """Return what kernels need to know of a scan.
+
+    First direction, increment, shortest and longest return, ``range_max``, and the number of
+    readings in a full turn where the sweep is closed, or else 0.
+    """
+    return (
+        scan.angle_min,
+        scan.angle_increment,
+        scan.shortest_return,
+        scan.longest_return,
+        scan.range_max,
+        round(2.0 * math.pi / abs(scan.angle_increment)) if scan.is_full_turn else 0,
+    )
+
+
+def surface_limits(
+    settings: AngleFunctionSettings,
+) -> tuple[tuple[float, float, float, float], float, bool]:
+    """Return the settings that kernels need: what connects, the baseline, whether to fit."""
+    gap = (
+        settings.grazing_angle,
+        settings.noise,
+        settings.largest_gap,
+        settings.smallest_jump,
+    )
+    return gap, settings.baseline, settings.fitted
 
 
 def angle_histogram(angles: AngleFunction, settings: AngleFunctionSettings) -> NDArray[np.float64]:
@@ -145,15 +158,14 @@ def main_angle(histogram: NDArray[np.float64]) -> float:
 
 
 @kernel
-def _angle_function(readings, geometry, range_max, turn, limits, baseline, fitted):  # type: ignore[no-untyped-def]
-    """All arrays of an ``AngleFunction``, in their order.
-
-    ``geometry`` is the first direction, the increment, the shortest and the longest return;
-    ``turn`` the number of readings in a full turn where the sweep is closed, or else 0.
-    """
-    step = abs(geometry[1])
+def _angle_function(readings, sweep, settings):  # type: ignore[no-untyped-def]
+    """All arrays of an ``AngleFunction``, in their order; see ``sweep`` and ``surface_limits``."""
+    angle_min, increment, shortest, longest, range_max, turn = sweep
+    limits, baseline, fitted = settings
+    step = abs(increment)
+    geometry = (angle_min, increment, shortest, longest)
     points, ranges, beams, indices, count = _returns(readings, geometry)
-    free = _free_before(readings, range_max, geometry[1], count)
+    free = _free_before(readings, range_max, increment, count)
     closed = max(count, turn) if turn > 0 else 0
     gaps = _gaps(ranges, indices, free, closed, step, limits)
     if turn > 0 and len(beams) > 0:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ._jit import kernel
 from .protocol import CORRECT_HEADING, CORRECT_POSITION
@@ -31,17 +30,18 @@ def inverses(matrices):  # type: ignore[no-untyped-def]
     return out
 
 
-def held(covariance: NDArray[np.float64]) -> float:
-    """Return how likely a pose of (3, 3) covariance is to be within 0.5 m and 10 degrees.
+@kernel
+def held(covariance):  # type: ignore[no-untyped-def]
+    """How likely a pose of (3, 3) covariance is to be within 0.5 m and 10 degrees.
 
     Position along the two axes of its ellipse, and heading, taken as independent.
     """
-    (a, b), (_, d) = covariance[:2, :2].tolist()
+    a, b, d = covariance[0, 0], covariance[0, 1], covariance[1, 1]
     mean, spread = 0.5 * (a + d), math.hypot(0.5 * (a - d), b)
-    variances = (mean + spread, max(mean - spread, 0.0), float(covariance[2, 2]))
+    variances = (mean + spread, max(mean - spread, 0.0), covariance[2, 2])
     limits = (CORRECT_POSITION, CORRECT_POSITION, CORRECT_HEADING)
     share = 1.0
-    for variance, limit in zip(variances, limits, strict=True):
-        if variance > 0.0:
-            share *= math.erf(limit / math.sqrt(2.0 * variance))
+    for k in range(3):
+        if variances[k] > 0.0:
+            share *= math.erf(limits[k] / math.sqrt(2.0 * variances[k]))
     return share

@@ -152,18 +152,21 @@ def covariance(fits: Fits, settings: DecisionSettings) -> NDArray[np.float64]:
     wide along a plain corridor, where no reading holds the pose.
     """
     covariances: NDArray[np.float64] = _covariances(
-        fits.hessians,
-        fits.residuals,
-        settings.range_deviation**2,
-        settings.readings_alike,
-        1.0 / settings.widest_deviation**2,
+        fits.hessians, fits.residuals, _deviations(settings)
     )
     return covariances
 
 
+def _deviations(settings: DecisionSettings) -> tuple[float, float, float]:
+    """Return least variance, readings that err together, and what is always known of a pose."""
+    widest = 1.0 / settings.widest_deviation**2
+    return settings.range_deviation**2, settings.readings_alike, widest
+
+
 @kernel
-def _covariances(hessians, residuals, least, alike, floor):  # type: ignore[no-untyped-def]
+def _covariances(hessians, residuals, deviations):  # type: ignore[no-untyped-def]
     """Inverse of each scaled Hessian plus a floor."""
+    least, alike, floor = deviations
     information = np.empty(hessians.shape)
     for k in range(len(hessians)):
         information[k] = hessians[k] / (max(residuals[k], least) * alike)
@@ -182,12 +185,29 @@ def decide(fits: Fits, anchors: int, settings: DecisionSettings) -> Decision:
     """
     if not len(fits):
         return Decision(np.empty(0), 1.0, False)
-    place = _logistic(float(np.dot(evidence(fits, anchors), settings.weights)))
-    best = place * held(covariance(fits[:1], settings)[0])
-    probabilities, elsewhere = _all_shared(
-        best, fits.features, settings.elsewhere, settings.rivalry
+    best, probabilities, elsewhere = _decided(
+        fits.features,
+        fits.hessians,
+        fits.residuals,
+        (fits.readings, anchors),
+        settings.weights,
+        _deviations(settings),
+        (settings.elsewhere, settings.rivalry),
     )
     return Decision(probabilities, elsewhere, best >= settings.threshold)
+
+
+@kernel
+def _decided(features, hessians, residuals, counts, weights, deviations, others):  # type: ignore[no-untyped-def]
+    """Probability of the best fit, of each, and of none of them."""
+    numbers = _evidence(features, hessians[0, 2, 2], counts[0], counts[1])
+    log_odds = 0.0
+    for k in range(len(numbers)):
+        log_odds += numbers[k] * weights[k]
+    place = 0.5 * (1.0 + math.tanh(0.5 * log_odds))  # the logistic function of any value
+    best = place * held(_covariances(hessians[:1], residuals[:1], deviations)[0])
+    shared, elsewhere = _shared(best, _worths(features), worth(others[0], 0.0), others[1])
+    return best, shared, elsewhere
 
 
 def worths(fits: Fits) -> NDArray[np.float64]:
@@ -202,11 +222,6 @@ def _worths(features):  # type: ignore[no-untyped-def]
     for k in range(len(features)):
         out[k] = worth(features[k, _SCORE], features[k, _THROUGH])
     return out
-
-
-@kernel
-def _all_shared(best, features, elsewhere, rivalry):  # type: ignore[no-untyped-def]
-    return _shared(best, _worths(features), worth(elsewhere, 0.0), rivalry)
 
 
 @kernel
@@ -226,8 +241,3 @@ def _shared(best, worths, elsewhere, rivalry):  # type: ignore[no-untyped-def]
         probabilities[k] = min(share, best)
         left -= probabilities[k]
     return probabilities, max(left, 0.0)
-
-
-def _logistic(value: float) -> float:
-    """Return 1 / (1 + exp(-value)) for any value."""
-    return 0.5 * (1.0 + math.tanh(0.5 * value))

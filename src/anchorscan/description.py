@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
+from ._jit import kernel
 from .anchors import (
     AnchorPoints,
+    AnchorSettings,
     VirtualEdges,
-    angle_anchors,
-    gather,
-    jump_edge_anchors,
+    all_anchors,
+    anchor_limits,
     virtual_edges,
 )
-from .angle_function import AngleFunction, angle_function
-from .evaluation import Outline, outline
-from .graph import AnchorGraph, anchor_graph
+from .angle_function import AngleFunction, _angle_function, surface_limits, sweep
+from .evaluation import Outline, _outline
+from .graph import AnchorGraph, _edges, edge_limits
 from .scan import LaserScan
-from .segments import Segments, segments
+from .segments import Segments, _segments, segment_limits
 from .settings import Settings
 
 __all__ = ["Description", "describe"]
@@ -29,29 +31,57 @@ class Description:
     Args:
         angles: Angle function (section 2).
         surfaces: Large connected surfaces (section 3).
-        edges: Walls behind the virtual edges, per main angle (section 3).
         anchors: Anchor points (section 3).
         graph: Anchor graph (section 4).
         outline: What it saw, for the evaluation (section 5).
+        settings: Of the anchor points.
     """
 
     angles: AngleFunction
     surfaces: Segments
-    edges: tuple[VirtualEdges, ...]
     anchors: AnchorPoints
     graph: AnchorGraph
     outline: Outline
+    settings: AnchorSettings
+
+    @cached_property
+    def edges(self) -> tuple[VirtualEdges, ...]:
+        """Walls behind the virtual edges, per main angle (section 3), for whoever looks at them."""
+        return tuple(virtual_edges(self.angles, self.settings))
 
 
 def describe(scan: LaserScan, settings: Settings) -> Description:
-    """Derive from one scan all that the matching needs (sections 2 to 4)."""
-    angles = angle_function(scan, settings.anchors.angle_function)
-    surfaces = segments(angles, settings.anchors.segments)
-    edges = virtual_edges(angles, settings.anchors)
-    anchors = gather(
-        jump_edge_anchors(angles, surfaces, settings.anchors),
-        angle_anchors(angles, surfaces, settings.anchors),
-        edges,
+    """Derive from one scan all that the matching needs (sections 2 to 4).
+
+    It is what the functions of the stages give one by one, in one kernel: to call ten of them
+    from Python took longer than what they do.
+    """
+    angles, surfaces, anchors, edges, seen = _described(
+        scan.ranges,
+        sweep(scan),
+        surface_limits(settings.anchors.angle_function),
+        segment_limits(settings.anchors.segments),
+        anchor_limits(settings.anchors),
+        edge_limits(settings.graph),
     )
-    graph = anchor_graph(anchors, settings.graph)
-    return Description(angles, surfaces, tuple(edges), anchors, graph, outline(scan, angles))
+    nodes = AnchorPoints(*anchors)
+    return Description(
+        AngleFunction(*angles, scan.range_max),
+        Segments(*surfaces),
+        nodes,
+        AnchorGraph(nodes, *edges),
+        Outline(*seen),
+        settings.anchors,
+    )
+
+
+@kernel
+def _described(readings, sweep, surface_limits, segment_limits, anchor_limits, edge_limits):  # type: ignore[no-untyped-def]
+    """The arrays of every part of a description."""
+    angles = _angle_function(readings, sweep, surface_limits)
+    points, ranges, beams, gaps, runs, way, _, _, _ = angles
+    surfaces = _segments(runs, way, segment_limits)
+    anchors = all_anchors(angles, surfaces, anchor_limits, sweep[4])
+    edges = _edges(anchors[0], edge_limits)
+    seen = _outline((points, ranges, beams, gaps), len(readings), sweep)
+    return angles, surfaces, anchors, edges, seen

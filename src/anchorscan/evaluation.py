@@ -35,6 +35,7 @@ from .angle_function import (
     AngleFunction,
     AngleFunctionSettings,
     angle_function,
+    sweep,
 )
 from .pose import Pose2D
 from .scan import LaserScan
@@ -164,11 +165,8 @@ def outline(scan: LaserScan, angles: AngleFunction) -> Outline:
         scan: The scan.
         angles: Its angle function, which knows what belongs to one surface.
     """
-    rows = _rows(angles.points, angles.ranges, angles.beams, angles.gaps)
-    step = abs(scan.angle_increment) or 1.0
-    count = max(min(len(scan), int(_FULL_TURN / step + 0.5)), 1)
-    first = scan.angle_min + min(scan.angle_increment, 0.0) * (count - 1)
-    return Outline(rows, np.array([first, step, count, scan.is_full_turn], np.float64))
+    seen = (angles.points, angles.ranges, angles.beams, angles.gaps)
+    return Outline(*_outline(seen, len(scan), sweep(scan)))
 
 
 def stack_outlines(outlines: Sequence[Outline]) -> OutlineStack:
@@ -325,13 +323,18 @@ _NO_ROWS = np.empty((0, 5))
 
 
 @kernel
-def _rows(points, ranges, beams, gaps):  # type: ignore[no-untyped-def]
-    """Columns of an outline in one table."""
+def _outline(seen, readings, sweep):  # type: ignore[no-untyped-def]
+    """Rows and geometry of the outline of a scan of so many readings."""
+    points, ranges, beams, gaps = seen
+    step = abs(sweep[1]) if sweep[1] != 0.0 else 1.0
+    count = max(min(readings, int(_FULL_TURN / step + 0.5)), 1)
+    first = sweep[0] + min(sweep[1], 0.0) * (count - 1)
+    geometry = np.array([first, step, float(count), 1.0 if sweep[5] > 0 else 0.0])
     rows = np.empty((len(ranges), 5))
     for i in range(len(ranges)):
         rows[i, _X], rows[i, _Y] = points[i, 0], points[i, 1]
         rows[i, _RANGE], rows[i, _BEAM], rows[i, _GAP] = ranges[i], beams[i], gaps[i]
-    return rows
+    return rows, geometry
 
 
 @kernel

@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import accumulate
 
 import numpy as np
@@ -47,16 +48,20 @@ class AnchorGraph:
         anchors: The nodes.
         nodes: (E, 2) int32, the two nodes a < b of every edge.
         lengths: (E,) metres, ascending.
-        directions: (E,) bearing from node a to node b, radians in (-pi, pi], scan frame.
     """
 
     anchors: AnchorPoints
     nodes: NDArray[np.int32]
     lengths: NDArray[np.float64]
-    directions: NDArray[np.float64]
 
     def __len__(self) -> int:
         return len(self.lengths)
+
+    @cached_property
+    def directions(self) -> NDArray[np.float64]:
+        """(E,) bearing from node a to node b, radians in (-pi, pi], scan frame."""
+        bearings: NDArray[np.float64] = _bearings(self.anchors.positions, self.nodes)
+        return bearings
 
     @property
     def node_a(self) -> NDArray[np.int32]:
@@ -95,8 +100,13 @@ class GraphStack:
 
 def anchor_graph(anchors: AnchorPoints, settings: GraphSettings) -> AnchorGraph:
     """Connect every anchor point with every other (section 4)."""
+    return AnchorGraph(anchors, *_edges(anchors.positions, edge_limits(settings)))
+
+
+def edge_limits(settings: GraphSettings) -> tuple[float, float]:
+    """Return the lengths, metres, between which edges are kept."""
     maximal = math.inf if settings.maximal_length is None else settings.maximal_length
-    return AnchorGraph(anchors, *_edges(anchors.positions, settings.minimal_length, maximal))
+    return settings.minimal_length, maximal
 
 
 def stack(graphs: Sequence[AnchorGraph]) -> GraphStack:
@@ -117,8 +127,9 @@ _NO_VALUES = np.empty(0)
 
 
 @kernel
-def _edges(positions, minimal, maximal):  # type: ignore[no-untyped-def]
-    """All pairs of nodes within the bounds: nodes, lengths and directions, by length."""
+def _edges(positions, limits):  # type: ignore[no-untyped-def]
+    """All pairs of nodes within the limits: nodes and lengths, by length."""
+    minimal, maximal = limits
     count = len(positions)
     most = count * (count - 1) // 2
     nodes = np.empty((most, 2), np.int32)
@@ -135,11 +146,16 @@ def _edges(positions, minimal, maximal):  # type: ignore[no-untyped-def]
                 lengths[found] = length
                 found += 1
     order = np.argsort(lengths[:found], kind="mergesort")
-    nodes = nodes[:found][order]
-    directions = np.empty(found)
-    for e in range(found):
+    return nodes[:found][order], lengths[:found][order]
+
+
+@kernel
+def _bearings(positions, nodes):  # type: ignore[no-untyped-def]
+    """Direction of every edge."""
+    bearings = np.empty(len(nodes))
+    for e in range(len(nodes)):
         a, b = nodes[e, 0], nodes[e, 1]
-        directions[e] = math.atan2(
+        bearings[e] = math.atan2(
             positions[b, 1] - positions[a, 1], positions[b, 0] - positions[a, 0]
         )
-    return nodes, lengths[:found][order], directions
+    return bearings

@@ -429,7 +429,7 @@ def _with_sector_of(
 
 def _graph(anchors: AnchorPoints) -> AnchorGraph:
     """A graph for a database that orders the edges by keys: it takes the anchor points alone."""
-    return AnchorGraph(anchors, _NO_NODES, _NO_VALUES, _NO_VALUES)
+    return AnchorGraph(anchors, _NO_NODES, _NO_VALUES)
 
 
 _NO_NODES, _NO_VALUES = np.empty((0, 2), np.int32), np.empty(0)

@@ -21,7 +21,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ._jit import kernel
+from ._jit import inlined, kernel
 from .anchors import AnchorKind, AnchorStack, stack_anchors
 from .angle_function import wrapped
 from .pairwise import Known
@@ -285,7 +285,7 @@ def _nearest(poses, number, known, grid, found, costs, relative):  # type: ignor
                 _compare(p, poses, number, known, k, found, costs, relative)
 
 
-@kernel
+@inlined
 def _compare(p, poses, number, known, k, found, costs, relative):  # type: ignore[no-untyped-def]
     """Note a reference for a pose where it is nearer than what was found before."""
     references, is_there = known

@@ -47,10 +47,12 @@ class Segments:
 
 def segments(angles: AngleFunction, settings: SegmentSettings) -> Segments:
     """Find the large connected surfaces of a scan (section 3)."""
-    first, last = _segments(
-        angles.runs, angles.way, settings.smallest_extent, settings.fewest_readings
-    )
-    return Segments(first, last)
+    return Segments(*_segments(angles.runs, angles.way, segment_limits(settings)))
+
+
+def segment_limits(settings: SegmentSettings) -> tuple[float, int]:
+    """Return the settings that kernels need: the way along a surface, and its readings."""
+    return settings.smallest_extent, settings.fewest_readings
 
 
 @kernel
@@ -71,8 +73,9 @@ def is_small(runs, way, extent):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _segments(runs, way, smallest_extent, fewest_readings):  # type: ignore[no-untyped-def]
+def _segments(runs, way, limits):  # type: ignore[no-untyped-def]
     """First and last return of every run that is long and dense enough."""
+    smallest_extent, fewest_readings = limits
     count = len(runs)
     first = np.empty(count, np.int64)
     last = np.empty(count, np.int64)

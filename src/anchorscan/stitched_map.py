@@ -319,29 +319,26 @@ class StitchedMap:
         """Name for each of the best fits the reference taken nearest, and compare with it."""
         settings = self._settings
         count = min(len(fits), settings.acceptance.hypotheses)
-        numbers, places, T_reference_scan = nearest(content.lots, fits.poses[:count])
-        if -1 in numbers.tolist():  # the last reference was removed meanwhile
+        found = nearest(content.lots, fits.poses[:count])
+        numbers, places, T_reference_scan = (array.tolist() for array in found)
+        if -1 in numbers:  # the last reference was removed meanwhile
             return (), []
-        known = [
-            self._know(content.lots[n], k)
-            for n, k in zip(numbers.tolist(), places.tolist(), strict=True)
-        ]
-        covariances = covariance(fits[:count], settings.decision)
+        known = [self._know(content.lots[n], k) for n, k in zip(numbers, places, strict=True)]
+        poses, scores = fits.poses.tolist(), fits.features[:, 0].tolist()
+        covariances = covariance(fits, settings.decision)
+        probabilities = decision.probabilities.tolist()
         hypotheses = tuple(
             Hypothesis(
                 reference=each.reference.identifier,
-                pose_in_reference=Pose2D(*T_reference_scan[n].tolist()),
-                pose=Pose2D(*fits.poses[n].tolist()),
+                pose_in_reference=Pose2D(*T_reference_scan[n]),
+                pose=Pose2D(*poses[n]),
                 covariance=covariances[n],
                 evaluation=evaluate_outlines(
-                    description.outline,
-                    each.description.outline,
-                    T_reference_scan[n],
-                    settings.evaluation,
+                    description.outline, each.description.outline, found[2][n], settings.evaluation
                 ),
                 quality=quality(description.graph, each.description.graph, settings.database),
-                score=float(fits.features[n, 0]),
-                probability=float(decision.probabilities[n]),
+                score=scores[n],
+                probability=probabilities[n],
                 accepted=decision.accepted and n == 0,
             )
             for n, each in enumerate(known)
