@@ -301,12 +301,12 @@ def anchor_limits(settings: AnchorSettings) -> tuple[tuple[Any, ...], ...]:
 
 
 @kernel
-def all_anchors(angles, surfaces, limits, reach):  # type: ignore[no-untyped-def]
+def all_anchors(angles, surfaces, limits):  # type: ignore[no-untyped-def]
     """Do what ``gather`` does in one go: positions, kinds, directions, and the main angle.
 
-    ``angles`` are the arrays of an ``AngleFunction``, ``surfaces`` those of ``Segments``.
+    ``angles`` are the values of an ``AngleFunction``, ``surfaces`` those of ``Segments``.
     """
-    points, _, _, gaps, _, way, surface, extents, moments = angles
+    points, _, _, gaps, _, way, surface, extents, moments, reach = angles
     rows = np.concatenate(
         (
             _jump_edges(points, gaps, way, surface, moments, surfaces, limits[0], reach),

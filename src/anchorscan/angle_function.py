@@ -98,9 +98,7 @@ def angle_function(scan: LaserScan, settings: AngleFunctionSettings) -> AngleFun
     A scan of either sense of rotation and any field of view will do; the ends of a full
     turn are neighbours, and a second look at the same direction is dropped.
     """
-    return AngleFunction(
-        *_angle_function(scan.ranges, sweep(scan), surface_limits(settings)), scan.range_max
-    )
+    return AngleFunction(*_angle_function(scan.ranges, sweep(scan), surface_limits(settings)))
 
 
 def sweep(scan: LaserScan) -> tuple[float, float, float, float, float, int]:
@@ -159,7 +157,7 @@ def main_angle(histogram: NDArray[np.float64]) -> float:
 
 @kernel
 def _angle_function(readings, sweep, settings):  # type: ignore[no-untyped-def]
-    """All arrays of an ``AngleFunction``, in their order; see ``sweep`` and ``surface_limits``."""
+    """All values of an ``AngleFunction``, in their order; see ``sweep`` and ``surface_limits``."""
     angle_min, increment, shortest, longest, range_max, turn = sweep
     limits, baseline, fitted = settings
     step = abs(increment)
@@ -172,7 +170,7 @@ def _angle_function(readings, sweep, settings):  # type: ignore[no-untyped-def]
         points, ranges, beams, gaps = _begin_at_gap(points, ranges, beams, gaps)
     runs, way, extents, moments = _runs(points, ranges, gaps, step, limits[1])
     surface = _surface(points, runs, way, moments, baseline, fitted)
-    return points, ranges, beams, gaps, runs, way, surface, extents, moments
+    return points, ranges, beams, gaps, runs, way, surface, extents, moments, range_max
 
 
 @kernel

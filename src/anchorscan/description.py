@@ -66,7 +66,7 @@ def describe(scan: LaserScan, settings: Settings) -> Description:
     )
     nodes = AnchorPoints(*anchors)
     return Description(
-        AngleFunction(*angles, scan.range_max),
+        AngleFunction(*angles),
         Segments(*surfaces),
         nodes,
         AnchorGraph(nodes, *edges),
@@ -77,11 +77,11 @@ def describe(scan: LaserScan, settings: Settings) -> Description:
 
 @kernel
 def _described(readings, sweep, surface_limits, segment_limits, anchor_limits, edge_limits):  # type: ignore[no-untyped-def]
-    """The arrays of every part of a description."""
+    """What every part of a description is made of."""
     angles = _angle_function(readings, sweep, surface_limits)
-    points, ranges, beams, gaps, runs, way, _, _, _ = angles
+    points, ranges, beams, gaps, runs, way, _, _, _, _ = angles
     surfaces = _segments(runs, way, segment_limits)
-    anchors = all_anchors(angles, surfaces, anchor_limits, sweep[4])
+    anchors = all_anchors(angles, surfaces, anchor_limits)
     edges = _edges(anchors[0], edge_limits)
     seen = _outline((points, ranges, beams, gaps), len(readings), sweep)
     return angles, surfaces, anchors, edges, seen

@@ -24,6 +24,7 @@ STAGES: Mapping[str, str] = {
     "segments": "extraction",
     "anchors": "extraction",
     "graph": "extraction",
+    "description": "extraction",
     "database": "search",
     "panorama": "search",
     "proposal": "search",
