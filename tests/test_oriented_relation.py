@@ -222,8 +222,8 @@ def test_no_more_database_edges_are_looked_at_than_allowed_and_rare_ones_first(m
     edges, _ = relation.edges(graphs, 0)
     looked_at = []
 
-    def vote(postings, ranges, turns, weights, opening, scratch, count):
-        looked_at.append(ranges[:, 1] - ranges[:, 0])
+    def vote(postings, keys, opening, unit, scratch, count):
+        looked_at.append(keys[0][:, 1] - keys[0][:, 0])
         return count
 
     monkeypatch.setattr(oriented_relation, "_vote", vote)

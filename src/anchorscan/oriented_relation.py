@@ -55,6 +55,10 @@ _TALLY_BITS = 16
 _FULL = (1 << _TALLY_BITS) - 1
 _FINEST_UNIT = 256
 _EXPECTED_TOTAL = 30_000
+# Slots that are counted together: their tallies are half of what a processor holds close by.
+_BLOCK_BITS = 15
+_BLOCK = 1 << _BLOCK_BITS
+_NO_BLOCK = np.uint32(0xFFFFFFFF)
 # References whose edges are put together at once.
 _AT_ONCE = 4096
 # Keys of a part per entry of its table of contents, about.
@@ -175,14 +179,13 @@ class _Scratch(NamedTuple):
     """What one thread counts with, as long as the largest set that it has searched.
 
     Args:
-        tallies: (N,) uint64, the four of every slot side by side; clear between searches.
-        is_met: A bit for every slot; clear between searches, too.
+        tallies: (``_BLOCK``,) uint64, the four of every slot of a block side by side; clear
+            between blocks.
         slots: (N,) those that were met.
         counts: (N,) n_m of those.
     """
 
     tallies: NDArray[np.uint64]
-    is_met: NDArray[np.uint64]
     slots: NDArray[np.int32]
     counts: NDArray[np.float32]
 
@@ -252,8 +255,7 @@ class OrientedRelation:
             alive: References among them that count.
 
         Returns:
-            (M,) slots in the order in which they were met, and (M,) n_m; valid until this
-            thread counts again.
+            (M,) slots, and (M,) n_m; valid until this thread counts again.
         """
         settings = self._settings
         tolerances = (
@@ -274,8 +276,7 @@ class OrientedRelation:
         count = 0
         for part, of_part in zip(parts, ranges, strict=True):
             keys = (of_part[order], turns[order], weights[order])
-            count = _vote(part.postings, *keys, opening, scratch, count)
-        _strength(scratch, 1.0 / unit, count)
+            count = _vote(part.postings, keys, opening, 1.0 / unit, scratch, count)
         self._scratch.all_clear = scratch
         return scratch.slots[:count], scratch.counts[:count]
 
@@ -307,8 +308,7 @@ class OrientedRelation:
         if scratch is None or len(scratch.slots) < used:
             room = max(2 * used, 64)
             scratch = _Scratch(
-                np.zeros(room, np.uint64),
-                np.zeros(room // 64 + 1, np.uint64),
+                np.zeros(_BLOCK, np.uint64),
                 np.empty(room, np.int32),
                 np.empty(room, np.float32),
             )
@@ -481,42 +481,63 @@ def _fit_together(keys, starts, postings, slots):  # type: ignore[no-untyped-def
 
 
 @kernel
-def _vote(postings, ranges, turns, weights, opening, scratch, count):  # type: ignore[no-untyped-def]
-    """Add weights to the tallies of slots, by the quarter turns between edge and query.
+def _vote(postings, keys, opening, unit, scratch, count):  # type: ignore[no-untyped-def]
+    """Add the weights of keys to the tallies of slots, by the turns between edge and query.
 
-    Slots that the first ``opening`` keys meet are noted, other keys count for these alone;
-    returns how many are noted now.
+    Slots that the first ``opening`` keys meet are noted, with the largest of their four tallies;
+    other keys count for these alone.  Returns how many are noted now.  All keys are counted for
+    one block of slots before the next, so that the tallies stay in the processor's cache.
     """
-    tallies, is_met, slots = scratch.tallies, scratch.is_met, scratch.slots
+    ranges, turns, weights = keys
+    left = ranges[:, 0].copy()
+    coming = np.full(len(ranges), _NO_BLOCK, np.uint32)
+    last = np.int64(-1)
     for c in range(len(ranges)):
-        weight = np.uint64(weights[c])
-        turn = np.uint32(turns[c])
-        for e in range(ranges[c, 0], ranges[c, 1]):
-            posting = postings[e]
-            slot = posting >> np.uint32(_TURN_BITS)
-            word, bit = slot >> np.uint32(6), np.uint64(1) << np.uint64(slot & np.uint32(63))
-            # The bits are few enough to stay in the processor; most edges end here.
-            if not is_met[word] & bit:
-                if c >= opening:
-                    continue
-                is_met[word] |= bit
-                slots[count] = slot
-                count += 1
-            shift = np.uint64(((posting - turn) & np.uint32(_TURNS - 1)) * np.uint32(_TALLY_BITS))
-            tally = tallies[slot]
-            room = np.uint64(_FULL) - ((tally >> shift) & np.uint64(_FULL))
-            tallies[slot] = tally + (min(weight, room) << shift)
+        if ranges[c, 0] < ranges[c, 1]:
+            coming[c] = postings[ranges[c, 0]] >> np.uint32(_BLOCK_BITS + _TURN_BITS)
+            end = postings[ranges[c, 1] - 1] >> np.uint32(_BLOCK_BITS + _TURN_BITS)
+            last = max(last, np.int64(end))
+    for block in range(last + 1):
+        begun = count
+        for c in range(len(ranges)):
+            if coming[c] == block:
+                some = (block, left[c], ranges[c, 1], np.uint32(turns[c]), np.uint64(weights[c]))
+                left[c], count = _tallied(postings, some, c < opening, scratch, count)
+                coming[c] = _NO_BLOCK
+                if left[c] < ranges[c, 1]:
+                    coming[c] = postings[left[c]] >> np.uint32(_BLOCK_BITS + _TURN_BITS)
+        _strength(scratch, unit, begun, count)
     return count
 
 
 @kernel
-def _strength(scratch, unit, count):  # type: ignore[no-untyped-def]
-    """The largest of the four tallies of every slot that was met; clears them."""
-    for k in range(count):
-        slot = scratch.slots[k]
-        tally = scratch.tallies[slot]
-        scratch.tallies[slot] = 0
-        scratch.is_met[slot >> 6] = 0
+def _tallied(postings, some, opens, scratch, count):  # type: ignore[no-untyped-def]
+    """Add the weight of one key for one block; returns where the next block begins."""
+    block, begin, end, turn, weight = some
+    for e in range(begin, end):
+        posting = postings[e]
+        slot = posting >> np.uint32(_TURN_BITS)
+        if slot >> np.uint32(_BLOCK_BITS) != block:
+            return e, count
+        tally = scratch.tallies[slot & np.uint32(_BLOCK - 1)]
+        if tally == 0:
+            if not opens:
+                continue
+            scratch.slots[count] = slot
+            count += 1
+        shift = np.uint64(((posting - turn) & np.uint32(_TURNS - 1)) * np.uint32(_TALLY_BITS))
+        room = np.uint64(_FULL) - ((tally >> shift) & np.uint64(_FULL))
+        scratch.tallies[slot & np.uint32(_BLOCK - 1)] = tally + (min(weight, room) << shift)
+    return end, count
+
+
+@kernel
+def _strength(scratch, unit, begun, count):  # type: ignore[no-untyped-def]
+    """The largest of the four tallies of the slots noted since ``begun``; clears them."""
+    for k in range(begun, count):
+        at = scratch.slots[k] & (_BLOCK - 1)
+        tally = scratch.tallies[at]
+        scratch.tallies[at] = 0
         best = np.uint64(0)
         for _ in range(_TURNS):
             best = max(best, tally & np.uint64(_FULL))
