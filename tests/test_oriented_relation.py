@@ -264,6 +264,36 @@ def test_what_the_rarest_keys_meet_is_counted_in_full_and_nothing_else(seed, ope
         assert sum(found for found, worth, _ in cells if found <= rarest) >= opening
 
 
+@given(st.integers(0, 1 << 30), st.integers(0, 30), st.sampled_from([1, 4000]))
+def test_slots_far_apart_are_counted_as_plain_counting_does(seed, opening, heaviest):
+    rng = np.random.default_rng(seed)
+    crowd = rng.integers(0, 200_000, 40)  # of several blocks
+    lists = [
+        sorted(set((4 * rng.choice(crowd, n) + rng.integers(0, 4, n)).tolist()))
+        for n in rng.integers(0, 20, 30)
+    ]
+    ends = np.cumsum([len(each) for each in lists])
+    ranges = np.column_stack([ends - [len(each) for each in lists], ends]).astype(np.int64)
+    turns = rng.integers(0, 4, 30).astype(np.uint8)
+    weights = rng.integers(1, heaviest + 1, 30).astype(np.uint16)
+    tallies = {}
+    for c, postings in enumerate(lists):
+        for posting in postings:
+            if c < opening or posting >> 2 in tallies:
+                tally = tallies.setdefault(posting >> 2, [0, 0, 0, 0])
+                turn = (posting - int(turns[c])) % 4
+                tally[turn] = min(tally[turn] + int(weights[c]), 65_535)
+    relation = OrientedRelation(SETTINGS)
+    scratch = relation._scratch_of(200_000)
+    postings = np.array([each for some in lists for each in some], np.uint32)
+    for begun in (0, 5):  # and it leaves nothing behind
+        count = oriented_relation._vote(
+            postings, (ranges, turns, weights), opening, 0.5, scratch, begun
+        )
+        found = zip(scratch.slots[begun:count].tolist(), scratch.counts[begun:count], strict=True)
+        assert dict(found) == {slot: 0.5 * max(tally) for slot, tally in tallies.items()}
+
+
 pairs = st.lists(st.tuples(st.integers(0, 40), st.integers(0, 30)), max_size=60)
 
 
