@@ -319,6 +319,18 @@ def test_an_answer_that_is_not_sure_is_not_taken_against_its_place():
     assert math.exp(unsure.nowhere) < 0.1
 
 
+@given(odds=st.floats(-6.0, 6.0))
+def test_a_sure_answer_is_taken_against_every_other_place_and_an_unsure_one_is_not(odds):
+    known, _ = admitted(nothing_known(), Found(TWO), SETTINGS)
+    known = replace(known, weights=np.log([0.5, 0.5]), unsearched=-9.0, nowhere=-9.0)
+    fits = some_fits(np.random.default_rng(0), known.poses, score=0.97, close=1.0, unknown=0.0)
+    plain = weighed(known, fits, np.arange(2), 0.1, SETTINGS)
+    after = weighed(known, fits, np.arange(2), 0.1, SETTINGS, Claim(0, odds))
+    lost = plain.support[1] - after.support[1]
+    assert lost == pytest.approx(min(max(odds, 0.0), SETTINGS.answered_against))
+    assert after.support[0] >= plain.support[0]
+
+
 @given(p=st.floats(0.0, 1.0), more=st.floats(0.0, 1.0))
 def test_a_surer_answer_gives_its_place_no_less_and_never_more_than_the_most(p, more):
     mixture, _ = admitted(nothing_known(), Found(TWO), SETTINGS)

@@ -31,8 +31,12 @@ is right, and its odds against a robot that is nowhere in the map are
 
 Both u and a are of the same scan, so they are not added: the place of the answer gets the larger
 of the two, and keeps what a is above u for a short way, over which it fades.  Like u it counts by
-the way driven.  And an answer speaks, by a, for all that had not been searched before, be its place
-new or one that was given up: this is how a robot that was carried away is found again.
+the way driven.  A sure answer also speaks against every other place: the search has compared it
+with them, and so errs much more rarely where one of them is right than where the map shows
+nothing of what the robot sees.  They lose a, up to ``answered_against``, in the same way; an
+unsure answer, as the right place has among look-alikes, takes nothing.  And an answer speaks, by
+a, for all that had not been searched before, be its place new or one that was given up: this is
+how a robot that was carried away is found again.
 
 A search also says when the pose of a known place has slipped: what it finds within reach of a
 place, by the covariances of both, is either another place or where this one is truly.  So it
@@ -133,6 +137,9 @@ class BeliefSettings(BaseModel):
         1.4, ge=0.0, description="weight of the log odds of an answer's probability"
     )
     most_answered: float = Field(6.0, ge=0.0, description="log odds that one answer can give")
+    answered_against: float = Field(
+        3.0, ge=0.0, description="most log odds that an answer takes from every other place"
+    )
     answer_fades: float = Field(
         4.0, gt=0.0, description="way on which what an answer added fades, metres"
     )
@@ -210,7 +217,7 @@ class Mixture:
         weights: (K,) collected along the way.
         support: (K,) log odds of the latest scan.
         record: (K,) mean log odds over the latest way.
-        answered: (K,) log odds that the latest answers add to those of a scan.
+        answered: (K,) log odds that the latest answer adds to those of a scan, or takes.
         unsearched: Of anywhere else.
         nowhere: Of what was searched and not found.
     """
@@ -384,7 +391,7 @@ def weighed(
     """
     plain, answered, count = log_odds(fits, settings), mixture.answered, len(mixture)
     if claim is not None:
-        answered = np.zeros(count)
+        answered = np.full(count, -min(max(claim.odds, 0.0), settings.answered_against))
         answered[claim.place] = max(claim.odds - plain[claim.place], 0.0)
     odds = plain + answered
     weights = mixture.weights.copy()

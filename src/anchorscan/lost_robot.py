@@ -37,7 +37,7 @@ from .matcher import Matcher
 from .monte_carlo import MonteCarlo
 from .pose import Pose2D
 from .progress import ProgressOf
-from .protocol import Answer, choose_references, thin
+from .protocol import Answer, Reliability, choose_references, reliability, thin
 from .record import Record
 from .reference import Reference
 from .scan import LaserScan
@@ -119,6 +119,8 @@ class Outcome:
         outside: Starts that do not count, since they or the next 10 m are not in the map.
         step_median: Seconds a step.
         step_99: 99th percentile of the same.
+        reliability: Of the probability reported at every step of all journeys; the truth is
+            right nowhere else than where the robot is, be that in the map or not.
     """
 
     place: str
@@ -128,6 +130,7 @@ class Outcome:
     outside: int
     step_median: float
     step_99: float
+    reliability: Reliability
 
 
 def _localizer(references: Sequence[Reference]) -> Callable[[], Follower]:
@@ -194,6 +197,9 @@ def run(
                     say(_line(made))
     if not outcomes:
         raise AnchorscanError("no journey starts within a map: the drives visit no place twice")
+    say(_STEPS_HEADER)
+    for one in outcomes:
+        say(_steps_line(one))
     if output_folder is not None:
         say(str(_kept(outcomes, Path(output_folder))))
     return tuple(outcomes)
@@ -253,7 +259,7 @@ def _measured(
     kidnapped = condition == "kidnapping"
     made = journeys(records, longest=longest, kidnap=kidnapped, seed=seed)
     prepared = _Prepared(FOLLOWERS[name])
-    recoveries, seconds, outside = [], [], 0
+    recoveries, steps, outside = [], list[Answer](), 0
     for number in progress(thin(range(len(made)), starts, seed), what, starts or len(made)):
         journey = made[number]
         references = course.references(journey)
@@ -270,12 +276,21 @@ def _measured(
         told = odometry(records, journey, _NOISE if noisy else 0.0, seed)
         answers = follow(records, journey, told, prepared.follower(references))
         recoveries.append(recovery(records, journey, answers))
-        seconds += [answer.seconds for answer in answers]
+        steps += answers
     if not recoveries:
         return None
-    seconds.sort()
-    middle, late = seconds[len(seconds) // 2], seconds[int(0.99 * len(seconds))]
-    return Outcome(course.place, condition, name, summary(recoveries), outside, middle, late)
+    seconds = sorted(step.seconds for step in steps)
+    named = [step for step in steps if step.pose is not None]
+    return Outcome(
+        course.place,
+        condition,
+        name,
+        summary(recoveries),
+        outside,
+        seconds[len(seconds) // 2],
+        seconds[int(0.99 * len(seconds))],
+        reliability([step.probability for step in named], [step.is_correct for step in named]),
+    )
 
 
 class _Prepared:
@@ -355,6 +370,19 @@ def _line(one: Outcome) -> str:
     )
 
 
+_STEPS_HEADER = (
+    "All steps by the probability reported: how many, and which share was right\n"
+    f"{'place':<18} {'condition':<10} {'method':<10}"
+    + "".join(f"{f'{low / 10:.1f} ..':>12}" for low in range(10))
+)
+
+
+def _steps_line(one: Outcome) -> str:
+    bins = zip(one.reliability.counts.tolist(), one.reliability.accuracy.tolist(), strict=True)
+    cells = "".join(f"{count:>7} {share:>4.2f}" if count else " " * 12 for count, share in bins)
+    return f"{one.place:<18} {one.condition:<10} {one.follower:<10}{cells}".rstrip()
+
+
 def _kept(outcomes: Sequence[Outcome], folder: Path) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / "lost-robot.json"
@@ -364,6 +392,11 @@ def _kept(outcomes: Sequence[Outcome], folder: Path) -> Path:
             "figures": {
                 name: None if math.isnan(value) else value
                 for name, value in asdict(one.figures).items()
+            },
+            "reliability": {
+                name: [None if math.isnan(each) else each for each in values.tolist()]
+                for name, values in asdict(one.reliability).items()
+                if name != "error"
             },
         }
         for one in outcomes
