@@ -153,7 +153,7 @@ class BeliefSettings(BaseModel):
     turn_alike: float = Field(2.0, gt=0.0, description="the same of a turn on the spot, radians")
     still: float = Field(0.01, ge=0.0, description="share of new evidence in a scan at rest")
     carried_away: float = Field(
-        1e-4, gt=0.0, lt=1.0, description="probability of being carried away, per metre"
+        1e-3, gt=0.0, lt=1.0, description="probability of being carried away, per metre"
     )
     search_again: float = Field(
         0.1, ge=0.0, description="share of 'nowhere' that is searched again, per metre"
