@@ -99,8 +99,14 @@ def test_a_lost_robot_is_found_by_the_command_and_the_table_is_kept(tmp_path):
     assert by_condition["noise"].found == 1.0
     assert by_condition["noise"].was_wrong == 0.0
     assert "known -> asked" in "\n".join(said)
+    # A robot that is sure is right: the last bin of the table of all steps.
+    steps = [line for line in said if line.startswith("known -> asked") and " noise " in line][-1]
+    reliability = next(one.reliability for one in outcomes if one.condition == "noise")
+    assert steps.split()[-2:] == [str(reliability.counts[-1]), f"{reliability.accuracy[-1]:.2f}"]
+    assert reliability.accuracy[-1] > 0.99
     kept = json.loads((tmp_path / "lost-robot.json").read_text())
     assert len(kept) == len(outcomes)
+    assert kept[0]["reliability"]["counts"] == outcomes[0].reliability.counts.tolist()
 
 
 def test_a_place_that_is_visited_once_has_no_course():
