@@ -68,6 +68,17 @@ class TestTraps:
         with pytest.raises(LogError, match="unfolds to 2"):
             open_log(path)
 
+    def test_what_a_message_quotes_cannot_break_its_line_or_speak_to_the_terminal(
+        self, tmp_path: Path
+    ) -> None:
+        path = tmp_path / "bomb.zip"
+        with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+            archive.writestr("a\n\x1b[2Jb\u2028.log", LINE * 30_000)
+        with pytest.raises(LogError, match="unfolds to 2") as refusal:
+            open_log(path)
+        assert r"a\n\x1b[2Jb\u2028.log unfolds" in str(refusal.value)
+        assert str(refusal.value).isprintable()
+
     def test_a_log_that_packs_well_is_no_bomb(self, tmp_path: Path) -> None:
         path = tmp_path / "still.log.gz"
         path.write_bytes(gzip.compress(LINE * 100))

@@ -15,12 +15,19 @@ __all__ = [
 ]
 
 
+# Names of files and what is quoted of them may hold anything, a line feed or a terminal's commands.
+_CONTROL = {code: repr(chr(code))[1:-1] for code in (*range(32), *range(127, 160), 0x2028, 0x2029)}
+
+
 class AnchorscanError(Exception):
     """Base of every error that anchorscan raises on purpose.
 
     The message is one line that says what is wrong and, where there is
     something to be done, what to do next.
     """
+
+    def __init__(self, message: str = "") -> None:
+        super().__init__(message.translate(_CONTROL))
 
 
 class ScanError(AnchorscanError):
