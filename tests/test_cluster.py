@@ -73,6 +73,14 @@ def test_a_cluster_gives_what_one_process_gives(two_workers: Spread) -> None:
     assert shown(two_workers) == shown(Spread())
 
 
+def test_what_cannot_be_held_is_a_known_error(two_workers: Spread, tmp_path: Path) -> None:
+    for spread in (Spread(), two_workers):
+        with pytest.raises(AnchorscanError, match=r"five\.log"):
+            spread.hold(squared, ITEMS)
+        with pytest.raises(AnchorscanError, match=r"none\.apr"):
+            SpreadFleet([tmp_path / "none.apr"], spread)
+
+
 def test_a_killed_worker_costs_only_its_running_piece(two_workers: Spread, tmp_path: Path) -> None:
     pieces = [(str(tmp_path), number) for number in ITEMS]
     done = list(two_workers.map(counted, pieces))
@@ -145,23 +153,6 @@ def _place(found: BuildingHypothesis) -> object:
 
 def _process(_: str, __: int) -> int:
     return os.getpid()
-
-
-def _ended(_: str, __: int) -> None:
-    os.kill(os.getpid(), signal.SIGKILL)
-
-
-def test_a_question_that_ends_workers_is_a_known_error(two_workers: Spread) -> None:
-    with pytest.raises(AnchorscanError, match="several workers died"):
-        list(two_workers.ask(_ended, two_workers.hold(str, "a"), [0]))
-
-
-def test_what_cannot_be_held_is_a_known_error(two_workers: Spread, tmp_path: Path) -> None:
-    for spread in (Spread(), two_workers):
-        with pytest.raises(AnchorscanError, match=r"five\.log"):
-            spread.hold(squared, ITEMS)
-        with pytest.raises(AnchorscanError, match=r"none\.apr"):
-            SpreadFleet([tmp_path / "none.apr"], spread)
 
 
 def _timeless(answer: benchmark.Answer) -> object:

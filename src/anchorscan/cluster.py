@@ -11,6 +11,7 @@ Workers run whatever a scheduler sends them: a scheduler belongs into a network 
 
 from __future__ import annotations
 
+import asyncio
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -28,9 +29,12 @@ Held = TypeVar("Held")
 
 # Pieces that may wait for a worker; more would only fill memory.
 _AHEAD = 4
+# What asking a worker ends with that has died, or does not come to make what it holds.
+_LOST = (OSError, RuntimeError, asyncio.TimeoutError)
 # Of workers that were asked the same, until the question is to blame.
 _DEATHS = 3
-_PATIENCE = 30
+# Seconds until nobody answers: a scheduler, or a worker that is to make what it holds.
+_PATIENCE = 60
 
 
 @dataclass(frozen=True)
@@ -157,8 +161,8 @@ class Holder(Generic[Held]):
         if self._client is None:
             return self._made, None
         try:
-            return self._made, self._made.result().ask(function, question)
-        except (OSError, RuntimeError) as error:
+            return self._made, self._made.result(_PATIENCE).ask(function, question)
+        except _LOST as error:
             return self._made, error
 
     def answer(
@@ -177,9 +181,10 @@ class Holder(Generic[Held]):
                 if isinstance(answer, Exception):
                     raise answer
                 return _value(answer.result())
-            except (OSError, RuntimeError) as error:
+            except _LOST as error:
                 died = error
             if made is self._made:
+                self._number += 1
                 self._make()
             made, answer = self.ask(function, question)
         raise AnchorscanError(f"several workers died of the same question: {died}") from died
