@@ -84,13 +84,9 @@ class Spread:
             yield from map(piece, items)
             return
         most = _AHEAD * max(self.workers, 1)
-        waiting: deque[tuple[Item, Any]] = deque()
-        for item in items:
-            waiting.append((item, self._client.submit(piece, item, pure=False)))
-            if len(waiting) >= most:
-                yield _result(*waiting.popleft())
-        while waiting:
-            yield _result(*waiting.popleft())
+        submit = partial(self._client.submit, piece, pure=False)
+        for item, future in _ahead(items, submit, most):
+            yield _result(item, future)
 
     def hold(self, make: Callable[[Item], Held], items: Iterable[Item]) -> list[Holder[Held]]:
         """Make values that stay with who makes them, to be asked.
@@ -130,13 +126,15 @@ class Spread:
             AnchorscanError: A known error that an answer ended with, or the same question ended
                 several workers.
         """
-        waiting: deque[tuple[Item, list[tuple[Any, Any]]]] = deque()
-        for question in questions:
-            waiting.append((question, [each.ask(function, question) for each in holders]))
-            if self._client is None or len(waiting) >= _AHEAD:
-                yield _answers(function, holders, *waiting.popleft())
-        while waiting:
-            yield _answers(function, holders, *waiting.popleft())
+
+        def put(question: Item) -> list[tuple[Any, Any]]:
+            return [each.ask(function, question) for each in holders]
+
+        for question, asked in _ahead(questions, put, 1 if self._client is None else _AHEAD):
+            yield [
+                each.answer(function, question, one)
+                for each, one in zip(holders, asked, strict=True)
+            ]
 
 
 class Holder(Generic[Held]):
@@ -280,13 +278,16 @@ def _value(done: Done[Any, Any]) -> Any:
     return done.value
 
 
-def _answers(
-    function: Callable[[Any, Any], Any],
-    holders: Sequence[Holder[Any]],
-    question: object,
-    asked: Sequence[tuple[Any, Any]],
-) -> list[Any]:
-    return [each.answer(function, question, one) for each, one in zip(holders, asked, strict=True)]
+def _ahead(
+    items: Iterable[Item], begin: Callable[[Item], Result], most: int
+) -> Iterator[tuple[Item, Result]]:
+    """Yield items with what was begun for them, at most so many ahead of who waits for them."""
+    waiting: deque[tuple[Item, Result]] = deque()
+    for item in items:
+        waiting.append((item, begin(item)))
+        if len(waiting) >= most:
+            yield waiting.popleft()
+    yield from waiting
 
 
 def _result(item: Item, future: Any) -> Done[Item, Result]:

@@ -120,17 +120,16 @@ def _named(
     share: Fleet, question: tuple[_Scans, list[list[BuildingPlace]]]
 ) -> list[list[tuple[int, BuildingHypothesis]]]:
     """Name those places that are in sets of this share, each with its rank."""
-    sets, answers = share.sets, []
+    sets = share.sets
+    answers: list[list[tuple[int, BuildingHypothesis]]] = []
     for scan, places in zip(*question, strict=True):
         ours = [(rank, place) for rank, place in enumerate(places) if place.building in sets]
-        description = describe(scan, share.settings) if ours else None
+        if not ours:
+            answers.append([])
+            continue
+        description = describe(scan, share.settings)
         answers.append(
-            [
-                (rank, found)
-                for rank, place in ours
-                if description is not None
-                for found in share.named(place, description)
-            ]
+            [(rank, found) for rank, place in ours for found in share.named(place, description)]
         )
     return answers
 
