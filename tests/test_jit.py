@@ -74,3 +74,30 @@ def test_a_kernel_is_compiled_anew_when_a_kernel_that_it_uses_has_changed(folder
 
 def test_kernels_work_where_no_cache_folder_is_writable(folder: Path) -> None:
     assert answer(folder, NUMBA_CACHE_DIR="/dev/null/none") == (2, 0)
+
+
+ANNOUNCED = """
+import logging
+logging.basicConfig(level=logging.INFO, format="%(name)s: %(message)s")
+import numpy
+from anchorscan.covariance import held, inverses
+held(numpy.eye(3)), inverses(numpy.eye(3)[None])
+"""
+
+
+def test_that_kernels_are_compiled_is_logged_once_and_not_when_they_come_from_the_cache(
+    tmp_path: Path,
+) -> None:
+    said = []
+    for _ in range(2):
+        done = subprocess.run(
+            [sys.executable, "-c", ANNOUNCED],
+            env={**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)},
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+        said.append(done.stderr)
+    assert said[0].startswith("anchorscan._jit: compiling for the first use")
+    assert said[0].count("\n") == 1
+    assert said[1] == ""

@@ -6,19 +6,26 @@ read-only installations); there a kernel is compiled anew in every process inste
 numba takes a cached kernel for current as long as its own file is unchanged, although the
 kernels and constants that it uses from other files are compiled into it.  So the stamp of a
 kernel's file is joined here with the stamps of what its module imports.
+
+A first search compiles for a minute or two; who wonders why it takes so long is told by a line
+of information in the log of this module.
 """
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Mapping
 from enum import EnumMeta
 from hashlib import blake2b
 from typing import Any
 
 import numba
+from numba.core import event
 from numba.core.dispatcher import Dispatcher
 
 __all__ = ["inlined", "kernel"]
+
+_LOG = logging.getLogger(__name__)
 
 
 def kernel(function: Callable[..., Any]) -> Any:
@@ -61,3 +68,23 @@ def _borrowed(names: Mapping[str, Any]) -> str:
             continue
         signature.update(f"{name}={held!r}\n".encode())
     return signature.hexdigest()
+
+
+class _Announcer(event.Listener):
+    """Logs once in a process that kernels are compiled which no cache had."""
+
+    def __init__(self) -> None:
+        self._silent = False
+
+    def on_start(self, event: Any) -> None:
+        """Hear that a function is about to be compiled."""
+        module = str(event.data["dispatcher"].py_func.__module__)
+        if not self._silent and module.partition(".")[0] == __package__:
+            self._silent = True
+            _LOG.info("compiling for the first use, which takes one or two minutes, once")
+
+    def on_end(self, event: Any) -> None:
+        """Hear that it was compiled."""
+
+
+event.register("numba:compile", _Announcer())  # type: ignore[no-untyped-call]

@@ -196,7 +196,8 @@ def _align(graph, references, edge_starts, node_starts, tolerances, counts, size
     )
     centres, in_cluster = _clusters(contributions, group_starts, size)
     branches = np.arange(len(maxima)) // matrix_peaks
-    distinct = _distinct(centres, np.diff(group_starts), branches // histogram_peaks, size)
+    sizes = group_starts[1:] - group_starts[:-1]
+    distinct = _distinct(centres, sizes, branches // histogram_peaks, size)
     branches = branches[distinct]
     poses, support, scatter = _unified(
         nodes,
@@ -284,7 +285,8 @@ def _peaks(histograms, most, tolerance):  # type: ignore[no-untyped-def]
     peaks = np.full((candidates, most), np.nan)
     left = np.empty(bins, np.int64)
     for c in range(candidates):
-        left[:] = histograms[c]
+        for k in range(bins):
+            left[k] = histograms[c, k]
         for p in range(most):
             fullest = 0
             at = -1
@@ -358,7 +360,8 @@ def _maxima(matrices, matrix_starts, columns, most):  # type: ignore[no-untyped-
                 continue
             k = begin + min(found, most - 1)
             while k > begin and maxima[k - 1, 2] < value:
-                maxima[k] = maxima[k - 1]
+                for column in range(3):
+                    maxima[k, column] = maxima[k - 1, column]
                 k -= 1
             at = element - matrix_starts[b]
             maxima[k, 0] = at // columns
@@ -433,7 +436,9 @@ def _clusters(poses, starts, size):  # type: ignore[no-untyped-def]
         group = poses[starts[g] : starts[g + 1]]
         inside = member[starts[g] : starts[g + 1]]
         if len(group) > 0:
-            centres[g] = group[_densest(group, size)]
+            densest = _densest(group, size)
+            for k in range(3):
+                centres[g, k] = group[densest, k]
             for _ in range(2):
                 _gather(group, centres[g], size, inside)
                 _centre(group, inside, centres[g])
@@ -560,6 +565,19 @@ def _spread(group, inside, mean, scatter):  # type: ignore[no-untyped-def]
 
 
 @kernel
+def _by_support(support, begin, end):  # type: ignore[no-untyped-def]
+    """The alignments of one candidate, the best supported first; equals keep their order."""
+    order = np.arange(begin, end)
+    for k in range(1, end - begin):
+        n = order[k]
+        while k > 0 and support[order[k - 1]] < support[n]:
+            order[k] = order[k - 1]
+            k -= 1  # noqa: PLW2901
+        order[k] = n
+    return order
+
+
+@kernel
 def _distinct(poses, support, candidates, size):  # type: ignore[no-untyped-def]
     """Alignments that differ, candidate after candidate, the best supported of equals."""
     chosen = np.empty(len(poses), np.int64)
@@ -569,9 +587,7 @@ def _distinct(poses, support, candidates, size):  # type: ignore[no-untyped-def]
         begin, first = end, found
         while end < len(poses) and candidates[end] == candidates[begin]:
             end += 1
-        order = np.argsort(-support[begin:end], kind="mergesort")
-        for k in order:
-            n = begin + k
+        for n in _by_support(support, begin, end):
             new = support[n] > 0
             for other in chosen[first:found]:
                 if _apart(poses[n], poses[other], size) <= 1.0:

@@ -22,11 +22,10 @@ def inverses(matrices):  # type: ignore[no-untyped-def]
         p, q, r = d * f - e * e, c * e - b * f, b * e - c * d
         s, t, u = a * f - c * c, b * c - a * e, a * d - b * b
         determinant = a * p + b * q + c * r
-        out[k, 0, 0], out[k, 1, 1], out[k, 2, 2] = p, s, u
-        out[k, 0, 1] = out[k, 1, 0] = q
-        out[k, 0, 2] = out[k, 2, 0] = r
-        out[k, 1, 2] = out[k, 2, 1] = t
-        out[k] /= determinant
+        out[k, 0, 0], out[k, 1, 1], out[k, 2, 2] = p / determinant, s / determinant, u / determinant
+        out[k, 0, 1] = out[k, 1, 0] = q / determinant
+        out[k, 0, 2] = out[k, 2, 0] = r / determinant
+        out[k, 1, 2] = out[k, 2, 1] = t / determinant
     return out
 
 

@@ -169,9 +169,11 @@ def _covariances(hessians, residuals, deviations):  # type: ignore[no-untyped-de
     least, alike, floor = deviations
     information = np.empty(hessians.shape)
     for k in range(len(hessians)):
-        information[k] = hessians[k] / (max(residuals[k], least) * alike)
-        for axis in range(3):
-            information[k, axis, axis] += floor
+        scale = max(residuals[k], least) * alike
+        for row in range(3):
+            for column in range(3):
+                information[k, row, column] = hessians[k, row, column] / scale
+            information[k, row, row] += floor
     return inverses(information)
 
 

@@ -254,9 +254,16 @@ class Matcher:
             (self._map if identifier in self._map else self._singles).remove(identifier)
 
     def prepare(self) -> None:
-        """Compile and derive everything, so that the first real scan does not pay for it."""
-        places = Matcher((Reference(0, _ROOM, Pose2D()),), self.settings)
-        places.add(Reference(1, _ROOM))
+        """Compile and derive what a search needs, so that the first real scan does not pay for it.
+
+        What references like these need, or, where there are none, what any could.  Once for an
+        installation that takes about a minute, as long as numba's cache lasts.
+        """
+        places = Matcher((), self.settings)
+        if self._map or not self._singles:
+            places.add(Reference(0, _ROOM, Pose2D()))
+        if self._singles or not self._map:
+            places.add(Reference(1, _ROOM))
         for candidates in (1, "all"):
             for hypothesis in (trace := places.explain(_ROOM, candidates)).hypotheses[:1]:
                 trace.evaluation(hypothesis)

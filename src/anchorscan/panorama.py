@@ -319,7 +319,8 @@ def _noted(pairs, count, k, turn, tried, found):  # type: ignore[no-untyped-def]
         found -= 1
     n = found
     while n > 0 and tried[n - 1, 3] < agreeing:
-        tried[n] = tried[n - 1]
+        for column in range(4):
+            tried[n, column] = tried[n - 1, column]
         n -= 1
     tried[n, 0], tried[n, 1], tried[n, 2], tried[n, 3] = turn, x, y, agreeing
     return found + 1

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import os
 import signal
 import sys
@@ -32,6 +33,7 @@ def guarded(command: Command) -> Command:
 
     @wraps(command)
     def guarded(*args: Any, **kwargs: Any) -> None:
+        _tell_of_compiling()
         try:
             command(*args, **kwargs)
             sys.stdout.flush()
@@ -57,6 +59,21 @@ def guarded(command: Command) -> Command:
 def say(message: str) -> None:
     """Tell the user something that is no result."""
     typer.echo(message, err=True)
+
+
+class _Saying(logging.Handler):
+    """Says what is logged."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        say(f"note: {record.getMessage()}")
+
+
+def _tell_of_compiling() -> None:
+    """Have kernels that are compiled announced: else the first search seems to hang."""
+    log = logging.getLogger("anchorscan._jit")
+    log.setLevel(logging.INFO)
+    log.handlers = [_Saying()]
+    log.propagate = False
 
 
 def write_lines(lines: Iterable[dict[str, Any]], path: Path | None) -> Iterator[dict[str, Any]]:
