@@ -27,6 +27,7 @@ from anchorscan import (
     drive,
     random_building,
 )
+from anchorscan import cluster as cluster_module
 from anchorscan.cluster import Spread, cluster
 from anchorscan.spread_fleet import SpreadFleet
 
@@ -48,6 +49,17 @@ def counted(piece: tuple[str, int]) -> int:
         os.kill(os.getpid(), signal.SIGKILL)
     time.sleep(0.02)
     return number
+
+
+def slowly_made(folder: str) -> str:
+    """Leave a mark for every time that it is made."""
+    (Path(folder) / f"made-{time.time_ns()}").touch()
+    time.sleep(4.0)
+    return "made"
+
+
+def sum_of(made: str, number: int) -> int:
+    return len(made) + number
 
 
 @pytest.fixture(scope="module")
@@ -79,6 +91,17 @@ def test_what_cannot_be_held_is_a_known_error(two_workers: Spread, tmp_path: Pat
             spread.hold(squared, ITEMS)
         with pytest.raises(AnchorscanError, match=r"none\.apr"):
             SpreadFleet([tmp_path / "none.apr"], spread)
+
+
+def test_what_takes_longer_to_make_than_anybody_is_waited_for_is_made_once(
+    two_workers: Spread, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Opening many sets, and compiling where nothing is compiled yet, takes minutes."""
+    two_workers.hold(str, "ab")  # the workers have imported what they need
+    monkeypatch.setattr(cluster_module, "_PATIENCE", 3.0)
+    held = two_workers.hold(slowly_made, [str(tmp_path)])
+    assert list(two_workers.ask(sum_of, held, [1, 2])) == [[len("made") + 1], [len("made") + 2]]
+    assert len(list(tmp_path.iterdir())) == 1
 
 
 def test_a_killed_worker_costs_only_its_running_piece(two_workers: Spread, tmp_path: Path) -> None:

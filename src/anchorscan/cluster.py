@@ -29,11 +29,11 @@ Held = TypeVar("Held")
 
 # Pieces that may wait for a worker; more would only fill memory.
 _AHEAD = 4
-# What asking a worker ends with that has died, or does not come to make what it holds.
+# What asking a worker ends with that has died, or does not come to hold anything.
 _LOST = (OSError, RuntimeError, asyncio.TimeoutError)
 # Of workers that were asked the same, until the question is to blame.
 _DEATHS = 3
-# Seconds until nobody answers: a scheduler, or a worker that is to make what it holds.
+# Seconds until nobody answers: a scheduler, or a worker that is to hold something.
 _PATIENCE = 60
 
 
@@ -102,8 +102,9 @@ class Spread:
             AnchorscanError: The first known error that one of them ended with.
         """
         holders = [Holder(make, item, n, self._client) for n, item in enumerate(items)]
-        for holder in holders:
-            holder.answer(_nothing, None, holder.ask(_nothing, None))
+        asked = [holder.ask(_nothing, None) for holder in holders]
+        for holder, one in zip(holders, asked, strict=True):
+            holder.answer(_nothing, None, one)
         return holders
 
     def ask(
@@ -204,12 +205,19 @@ class Holder(Generic[Held]):
 
 
 class _Held(Generic[Held]):
-    """A value at its worker."""
+    """A value at its worker, made when it is first asked.
+
+    To make it may take minutes, and an actor that is slow to come cannot be told from one that
+    never comes; one that is slow to answer can, since Dask notices when its worker dies.
+    """
 
     def __init__(self, make: Callable[[Any], Held], item: object) -> None:
-        self._made = _done(make, item)
+        self._recipe = (make, item)
+        self._made: Done[Any, Held] | None = None
 
     def ask(self, function: Callable[[Held, Any], Any], question: object) -> Done[Any, Any]:
+        if self._made is None:
+            self._made = _done(*self._recipe)
         if self._made.value is None:
             return Done(question, None, self._made.error)
         return _done(partial(function, self._made.value), question)
