@@ -463,7 +463,7 @@ def _figure_rows(cases: Sequence[_Case], found: Figures | None) -> list[tuple[st
         ("position error, 90 %", centimetres(found.position_90)),
         ("heading error, median", degrees(found.heading_median)),
         ("heading error, 90 %", degrees(found.heading_90)),
-        ("covariance honest (95 % expected)", share(found.honest_covariance)),
+        ("covariance honest (95 % if the truth is exact)", share(found.honest_covariance)),
     ]
 
 
