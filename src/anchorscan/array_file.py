@@ -31,7 +31,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["read_arrays", "write_arrays"]
+__all__ = ["keep_names", "read_arrays", "write_arrays"]
 
 _MAGIC = b"anchorscan arrays 2\n"
 _ALIGNED = 64
@@ -80,14 +80,19 @@ def write_arrays(
             stream.flush()
             os.fsync(stream.fileno())
         draft.replace(path)
-        with suppress(OSError):  # not every system lets a folder be synchronised
-            folder = os.open(path.parent, os.O_RDONLY)
-            try:
-                os.fsync(folder)
-            finally:
-                os.close(folder)
+        keep_names(path.parent)
     finally:
         draft.unlink(missing_ok=True)
+
+
+def keep_names(folder: Path) -> None:
+    """Have the names of a folder's files outlast a loss of power, where the system can."""
+    with suppress(OSError):
+        opened = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(opened)
+        finally:
+            os.close(opened)
 
 
 def read_arrays(path: Path, made_of: str, *, verify: bool = True) -> dict[str, NDArray[Any]] | None:

@@ -40,6 +40,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from .array_file import keep_names
 from .errors import ReferenceSetError, ScanError
 from .pose import Pose2D
 from .reference import Reference
@@ -797,12 +798,7 @@ def _publish(draft: Path, path: Path) -> None:
         if os.path.lexists(path):
             raise FileExistsError("exists already") from None
         draft.rename(path)
-    with suppress(OSError):  # not every system lets a folder be synchronised
-        folder = os.open(path.parent, os.O_RDONLY)
-        try:
-            os.fsync(folder)
-        finally:
-            os.close(folder)
+    keep_names(path.parent)
 
 
 def _check_schema(connection: sqlite3.Connection) -> None:
