@@ -42,6 +42,8 @@ _MERGED_SHARE = 0.25
 _SMALLEST_PART = 4096
 # A reference of fewer edges counts as one of so many oriented ones: few edges prove little.
 _FEWEST_EDGES = 16
+# So few references are put in order sooner than it takes to tell which are among the best.
+_FEW = 128
 # The histogram that tells which qualities are among the best: bins of the square root of the
 # quality, and how many of them make one.
 _BINS = 4096
@@ -233,7 +235,9 @@ class RelationshipDatabase:
         slots, counts = self._relation.met(graph, state.parts, state.used, state.alive)
         edges = (self._relation.size(graph), self._fewest)
         if most is not None and most < len(slots):
-            chosen = _promising(slots, counts, state.sizes, edges, most)
+            chosen: slice | NDArray[np.int64] = slice(None)
+            if len(slots) > _FEW:
+                chosen = _promising(slots, counts, state.sizes, edges, most)
             found = _in_order(slots[chosen], counts[chosen], state, edges, most)
             if len(found[0]) == most:
                 return Votes(*found)

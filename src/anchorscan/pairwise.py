@@ -187,30 +187,32 @@ def _hypotheses(
 ) -> tuple[Hypothesis, ...]:
     """Order the evaluated alignments and say what each is worth."""
     order = np.lexsort((found.candidates, -found.support, -e_m))[: settings.acceptance.hypotheses]
-    worth = probability(e_m, settings.acceptance)
+    candidates, fits = found.candidates[order], e_m[order]
+    named = [references[candidate] for candidate in candidates.tolist()]
     covariances = _covariances(
         found.scatter[order],
-        np.array([_heading(references[c]) for c in found.candidates[order].tolist()]),
+        np.array([_heading(reference) for reference in named]),
         settings.alignment.position_deviation,
         settings.alignment.heading_deviation,
     )
+    # As plain numbers at once: to take them out of arrays one by one takes several times as long.
+    poses, qualities = found.poses[order].tolist(), votes.quality[candidates].tolist()
+    worth = probability(fits, settings.acceptance).tolist()
+    threshold = settings.acceptance.threshold
     hypotheses = []
-    for n, covariance in zip(order.tolist(), covariances, strict=True):
-        candidate = int(found.candidates[n])
-        reference = references[candidate]
-        T_reference_scan = Pose2D(*found.poses[n].tolist())
-        fit = float(e_m[n])
+    for n, (reference, fit) in enumerate(zip(named, fits.tolist(), strict=True)):
+        T_reference_scan = Pose2D(*poses[n])
         hypotheses.append(
             Hypothesis(
                 reference=reference.identifier,
                 pose_in_reference=T_reference_scan,
                 pose=None if reference.pose is None else reference.pose @ T_reference_scan,
-                covariance=covariance,
+                covariance=covariances[n],
                 evaluation=fit,
-                quality=float(votes.quality[candidate]),
+                quality=qualities[n],
                 score=fit,
-                probability=float(worth[n]),
-                accepted=fit >= settings.acceptance.threshold,
+                probability=worth[n],
+                accepted=fit >= threshold,
             )
         )
     return tuple(hypotheses)
