@@ -542,7 +542,8 @@ def _checked(chosen, tiles, out, found, most):  # type: ignore[no-untyped-def]
             continue
         score = _first_check(table, heading, out[k, 0], out[k, 1], tiles)
         if score >= 0:
-            out[kept] = out[k]
+            for value in range(3):
+                out[kept, value] = out[k, value]
             scores[kept] = score
             kept += 1
     full = 127 * max(len(chosen), 1)
