@@ -18,7 +18,7 @@ from fuzz.targets import TARGETS, HungryError, SlowError, Target, execute
 
 # Executions that take about a second.
 RUNS = {"bag": 150, "bag-metadata": 100, "bag-message": 30, "set-sealed": 200, "map-scans": 200}
-RUNS |= {"scan": 200, "scan-paper": 200, "tum": 500, "set": 200, "map": 600}
+RUNS |= {"index": 100, "scan": 200, "scan-paper": 200, "tum": 500, "set": 200, "map": 600}
 USUAL = 1000
 NEEDS = {"bag": "rosbags", "bag-metadata": "rosbags", "bag-message": "rosbags", "map": "PIL"}
 NEEDS |= {"map-scans": "PIL"}
