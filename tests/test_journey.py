@@ -84,6 +84,18 @@ def test_metres_count_until_the_first_confident_and_correct_report():
     assert wrong.was_wrong
 
 
+def test_a_slip_is_told_from_another_place():
+    records = line(10)
+    journey = Journey(tuple(range(10)))
+    slipped, away = (
+        recovery(records, journey, reports(records, journey, {3: Pose2D(3.0 + off)}))
+        for off in (1.5, 2.5)
+    )
+    assert (slipped.was_wrong, slipped.was_far) == (True, False)
+    assert (away.was_wrong, away.was_far) == (True, True)
+    assert summary([slipped, away]).was_far == 0.5
+
+
 def test_after_a_kidnapping_the_old_pose_must_go_within_two_metres():
     records = line(60)
     journey = Journey((*range(5), *range(40, 50)), jump=5)
@@ -107,13 +119,17 @@ def test_every_record_needs_a_report():
 
 def test_summary_by_hand():
     found = summary(
-        [Recovery(1.0, False, 1.0), Recovery(3.0, True, 5.0), Recovery(math.inf, False, math.inf)]
+        [
+            Recovery(1.0, False, False, 1.0),
+            Recovery(3.0, True, True, 5.0),
+            Recovery(math.inf, False, False, math.inf),
+        ]
     )
     assert found.journeys == 3
     assert found.found == pytest.approx(2 / 3)
     assert found.driven_median == 2.0
     assert found.driven_90 == pytest.approx(2.8)
-    assert found.was_wrong == pytest.approx(1 / 3)
+    assert found.was_wrong == found.was_far == pytest.approx(1 / 3)
     assert found.withdrawn == pytest.approx(1 / 3)
     with pytest.raises(ValueError, match="no journeys"):
         summary([])

@@ -33,6 +33,7 @@ __all__ = [
 _EVERY = 20
 _APART = 10.0
 _WITHDRAWN = 2.0
+_FAR = 2.0
 _GAP = 20.0
 
 
@@ -57,12 +58,15 @@ class Recovery:
         driven: Metres until the first confident and correct report; infinite if there was none.
         was_wrong: Whether a confident wrong pose was ever reported; after a jump, later than
             2 m behind it.
+        was_far: The same of a confident pose that was more than 2 m off: another place, where
+            less may be a slip, or a stretch where two passes of the log itself disagree.
         withdrawn: Metres from the jump until no pose of before it was reported any more;
             infinite if that never ended, NaN without a jump.
     """
 
     driven: float
     was_wrong: bool
+    was_far: bool = False
     withdrawn: float = math.nan
 
 
@@ -76,6 +80,7 @@ class RecoveryFigures:
         driven_median: Metres until then, of those that did.
         driven_90: 90th percentile of the same.
         was_wrong: Share that ever reported a confident wrong pose.
+        was_far: Share that ever reported one that was more than 2 m off.
         withdrawn: Share that withdrew the old pose within 2 m of the jump; NaN without a jump.
     """
 
@@ -84,6 +89,7 @@ class RecoveryFigures:
     driven_median: float
     driven_90: float
     was_wrong: float
+    was_far: float
     withdrawn: float
 
 
@@ -187,12 +193,12 @@ def recovery(records: Sequence[Record], journey: Journey, reports: Sequence[Answ
     metres = [along - driven[begin] for along in driven[begin:]] if driven else []
     later = list(zip(metres, reports[begin:], strict=True))
     right = [m for m, report in later if report.accepted and report.is_correct]
-    wrong = [m for m, report in later if report.accepted and not report.is_correct]
     first = min(right, default=math.inf)
-    if journey.jump is None:
-        return Recovery(first, bool(wrong))
-    withdrawn = _withdrawn(records, journey, later)
-    return Recovery(first, any(m > _WITHDRAWN for m in wrong), withdrawn)
+    allowed = -math.inf if journey.jump is None else _WITHDRAWN
+    wrong = [r for m, r in later if m > allowed and r.accepted and not r.is_correct]
+    far = any(_is_far(report) for report in wrong)
+    withdrawn = math.nan if journey.jump is None else _withdrawn(records, journey, later)
+    return Recovery(first, bool(wrong), far, withdrawn)
 
 
 def summary(recoveries: Sequence[Recovery]) -> RecoveryFigures:
@@ -211,6 +217,7 @@ def summary(recoveries: Sequence[Recovery]) -> RecoveryFigures:
         driven_median=float(np.median(driven)) if driven else math.nan,
         driven_90=float(np.percentile(driven, 90)) if driven else math.nan,
         was_wrong=sum(one.was_wrong for one in recoveries) / len(recoveries),
+        was_far=sum(one.was_far for one in recoveries) / len(recoveries),
         withdrawn=(
             sum(metres <= _WITHDRAWN for metres in withdrawn) / len(withdrawn)
             if withdrawn
@@ -266,6 +273,14 @@ def _kidnapped(
         return None
     there = int(rng.choice(places))
     return Journey((*journey.positions[:half], *usable[there : there + left]), half)
+
+
+def _is_far(report: Answer) -> bool:
+    return (
+        report.pose is not None
+        and report.truth is not None
+        and report.pose.distance(report.truth) > _FAR
+    )
 
 
 def _driven(records: Sequence[Record], journey: Journey) -> list[float]:

@@ -78,7 +78,9 @@ def bench(
     baselines: Annotated[
         list[str] | None,
         typer.Option(
-            "--baseline", metavar="NAME", help="exhaustive, karto, for P5 amcl, or none; all."
+            "--baseline",
+            metavar="NAME",
+            help="exhaustive, karto, or none; for P5 amcl, window; all but window.",
         ),
     ] = None,
     baseline_queries: Annotated[
@@ -100,7 +102,8 @@ def bench(
         protocols = [protocol for protocol in protocols if protocol != "P5"]
         if not protocols:
             return
-        baselines = None if baselines is None else [n for n in baselines if n != "amcl"] or ["none"]
+        if baselines is not None:
+            baselines = [n for n in baselines if n not in ("amcl", "window")] or ["none"]
     with sharing.cluster() as spread:
         run(
             logs or (),
@@ -131,10 +134,10 @@ def _bench_lost_robot(
     from ..lost_robot import run
 
     paths = logs or default_drives(typer.echo)
-    with_baseline = baselines is None or "amcl" in baselines
+    others = [name for name in ("window", "amcl") if name in (baselines or ["amcl"])]
     run(
         read_drives(progress(paths, "reading", len(paths))),
-        ("anchorscan", "amcl") if with_baseline else ("anchorscan",),
+        ("anchorscan", *others),
         starts=starts,
         baseline_starts=baseline_starts,
         seed=seed,
