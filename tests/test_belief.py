@@ -28,6 +28,7 @@ from anchorscan.belief import (
     nothing_known,
     probabilities,
     tidied,
+    together,
     weighed,
 )
 from anchorscan.motion import motion
@@ -190,6 +191,30 @@ def test_a_step_keeps_places_bounded_apart_and_summing_to_one(seed, share):
     fields = (after.poses, after.covariances, after.weights, after.support, after.record)
     fields += (after.answered,)
     assert {len(each) for each in fields} == {len(after)}
+
+
+def test_poses_a_hand_apart_are_followed_apart_and_reported_together():
+    shares = np.array([0.395, 0.6, 0.005])
+    poses = np.array([[0.2, 0.0, 0.0], [0.0, 0.0, 0.0], [0.4, 0.0, 0.0]])
+    none = np.zeros(3)
+    mixture = Mixture(
+        poses, np.tile(0.01 * np.eye(3), (3, 1, 1)), np.log(shares), none, none, none, -1e3
+    )
+    assert len(tidied(mixture, SETTINGS)) == 3
+    places, worth = together(mixture, SETTINGS)
+    assert places.tolist() == [1, 2]
+    assert worth == pytest.approx([0.995, 0.005])
+
+
+@given(seed=seeds)
+def test_what_is_reported_together_takes_nothing_away_and_counts_nothing_twice(seed):
+    mixture = some_mixture(np.random.default_rng(seed), 20)
+    places, worth = together(mixture, SETTINGS)
+    each = probabilities(mixture, SETTINGS)
+    assert worth.sum() == pytest.approx(each.sum())
+    assert (worth >= each[places] - 1e-12).all()
+    owners = _owners(mixture.poses[places], SETTINGS.together, SETTINGS.same_turn)
+    assert owners.tolist() == list(range(len(places)))
 
 
 @given(seed=seeds)
@@ -417,10 +442,11 @@ def slipped(ahead, scores, **found):
 
 
 def test_a_search_corrects_the_pose_of_a_place_where_the_scan_speaks_for_it():
-    after = slipped(0.2, [0.72, 0.97])
-    assert after.poses[0, 0] == 0.0
-    assert len(after) == 1
-    assert slipped(0.2, [0.95, 0.96]).poses[0, 0] == 0.2
+    for off, left in ((0.12, 1), (0.2, 2)):
+        after = slipped(off, [0.72, 0.97])
+        assert after.poses[0, 0] == 0.0
+        assert len(after) == left
+        assert slipped(off, [0.95, 0.96]).poses[0, 0] == off
 
 
 def test_a_sure_answer_is_no_witness_of_the_pose_that_it_contradicts():
@@ -430,7 +456,7 @@ def test_a_sure_answer_is_no_witness_of_the_pose_that_it_contradicts():
 
 def test_a_slip_further_than_a_place_is_followed_as_a_rival_and_silences_both():
     after = slipped(0.6, [0.93, 0.95])
-    assert len(after) == 2
+    assert len(after) == len(together(after, SETTINGS)[0]) == 2
     worth = np.sort(probabilities(after, SETTINGS))
     assert worth[0] > 0.05
     assert worth[1] < SETTINGS.threshold

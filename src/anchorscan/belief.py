@@ -40,9 +40,10 @@ how a robot that was carried away is found again.
 
 A search also says when the pose of a known place has slipped: what it finds within reach of a
 place, by the covariances of both, is either another place or where this one is truly.  So it
-starts with a share of its weight, taken off it.  Poses that stay one place are joined at once,
-and the one that the scan speaks for is kept; further off, both are followed, and nothing is
-reported until the way has told which it is.
+starts with a share of its weight, taken off it.  Poses that are all but equal are joined at once,
+and the likelier is kept; further off, both are followed.  Whoever acts on a pose does not mind
+which of two it is that are a hand apart, so those are reported together, as the likelier; of
+others nothing is reported until the way has told which it is.
 
 Weights compare places with each other; whether the best of them is any good is another matter.
 A pose that slips off along a corridor or where little is known, or one carried on in a place
@@ -90,6 +91,7 @@ __all__ = [
     "probabilities",
     "stiffness",
     "tidied",
+    "together",
     "weighed",
 ]
 
@@ -99,7 +101,7 @@ _SCORE, _CLOSE, _FREE, _UNKNOWN, _THROUGH = (
 _SMALLEST_SHARE = 0.05
 _LEAST_PROBABILITY = 1e-4
 # Of the limits of one place: nearer poses are the same fit, and need no second look.
-_REFOUND = 1.0 / 3.0
+_REFOUND_DISTANCE, _REFOUND_TURN = 2.0 / 3.0, 1.0 / 3.0
 _NEVER = -1e3  # logarithm of a weight that is none, finite so that differences are
 
 
@@ -165,8 +167,11 @@ class BeliefSettings(BaseModel):
         0.3, gt=0.0, description="of the position of a place when it is found, metres"
     )
     found_turn: float = Field(0.15, gt=0.0, description="of its heading, radians")
-    same_distance: float = Field(0.3, gt=0.0, description="places nearer are one, metres")
+    same_distance: float = Field(0.15, gt=0.0, description="places nearer are one, metres")
     same_turn: float = Field(0.15, gt=0.0, description="places turned less are one, radians")
+    together: float = Field(
+        0.3, gt=0.0, description="poses nearer are reported as one, which is the likeliest, metres"
+    )
     reach: float = Field(
         3.0, ge=0.0, description="deviations within which a place may have been mistaken"
     )
@@ -310,7 +315,7 @@ def admitted(
     position[: int(found.accepted)] = settings.answer_deviation
     turn = np.full(len(position), settings.found_turn)
     spread = np.square(np.column_stack([position, position, turn]))[:, :, None] * np.eye(3)
-    same = (_REFOUND * settings.same_distance, _REFOUND * settings.same_turn)
+    same = (_REFOUND_DISTANCE * settings.same_distance, _REFOUND_TURN * settings.same_turn)
     new, parents = _new(
         (mixture.poses, mixture.covariances, mixture.weights),
         (found.poses, spread),
@@ -456,6 +461,23 @@ def probabilities(mixture: Mixture, settings: BeliefSettings) -> NDArray[np.floa
     total = mixture.weights + settings.support * mixture.support
     one = _log_sum(np.append(total, [mixture.unsearched, mixture.nowhere]))
     return np.asarray(np.exp(total - one))
+
+
+def together(
+    mixture: Mixture, settings: BeliefSettings
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Take poses that are as good as one for whoever acts on them together.
+
+    Returns:
+        (N,) places, likeliest first, no two of which are nearer than that; (N,) probability of
+        each with all that are nearer to it than to one before.
+    """
+    worth = probabilities(mixture, settings)
+    order = np.argsort(-worth, kind="stable")
+    owner = _owners(mixture.poses[order], settings.together, settings.same_turn)
+    summed = np.bincount(owner, worth[order], minlength=len(order))
+    named = np.flatnonzero(owner == np.arange(len(order)))
+    return order[named], summed[named]
 
 
 def has_stood(mixture: Mixture, place: int, settings: BeliefSettings) -> bool:

@@ -30,9 +30,9 @@ from .belief import (
     has_stood,
     moved,
     nothing_known,
-    probabilities,
     stiffness,
     tidied,
+    together,
     weighed,
 )
 from .covariance import held
@@ -228,9 +228,8 @@ class Localizer:
     def _report(self) -> Belief:
         """Name the likeliest places."""
         mixture, settings = self._mixture, self._settings
-        worth = probabilities(mixture, settings)
-        order = np.argsort(-worth, kind="stable")[:_NAMED]
-        right = worth[order] * [held(mixture.covariances[k]) for k in order]
+        order, worth = together(mixture, settings)
+        right = worth[:_NAMED] * [held(mixture.covariances[k]) for k in order[:_NAMED]]
         best = np.argsort(-right, kind="stable")
         order, right = order[best], right[best]
         references, T_reference_laser = self._places.nearest(mixture.poses[order])
