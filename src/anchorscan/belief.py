@@ -475,7 +475,7 @@ def together(
     worth = probabilities(mixture, settings)
     order = np.argsort(-worth, kind="stable")
     owner = _owners(mixture.poses[order], settings.together, settings.same_turn)
-    summed = np.bincount(owner, worth[order], minlength=len(order))
+    summed = np.bincount(owner, worth[order], minlength=len(order)).astype(np.float64)
     named = np.flatnonzero(owner == np.arange(len(order)))
     return order[named], summed[named]
 

@@ -38,7 +38,7 @@ from .belief import (
 from .covariance import held
 from .hypothesis import Hypothesis
 from .matcher import _ROOM, Candidates, Matcher, Trace
-from .motion import Motion, Odometer
+from .motion import Motion, Odometer, new_share
 from .pose import Pose2D
 from .record import Record
 from .reference import Reference
@@ -218,12 +218,11 @@ class Localizer:
 
     def _share(self, step: Motion, expected: Mixture, fits: Fits) -> float:
         """How much of a scan's evidence is new; by the motion seen, where none was measured."""
-        settings = self._settings
         driven, turned = step.driven, step.turned
         if not step.measured and len(expected):
             before, now = Pose2D(*expected.poses[0].tolist()), Pose2D(*fits.poses[0].tolist())
             driven, turned = min(driven, before.distance(now)), min(turned, before.turn(now))
-        return min(driven / settings.way_alike + turned / settings.turn_alike + settings.still, 1.0)
+        return new_share(driven, turned, self._settings)
 
     def _report(self) -> Belief:
         """Name the likeliest places."""

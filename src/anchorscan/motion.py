@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +18,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from .pose import Pose2D
 
-__all__ = ["Motion", "MotionSettings", "Odometer", "motion"]
+__all__ = ["Motion", "MotionSettings", "Odometer", "motion", "new_share"]
 
 
 class MotionSettings(BaseModel):
@@ -95,6 +96,22 @@ def motion(
 
 def _diagonal(position: float, heading: float) -> NDArray[np.float64]:
     return np.diag(np.square((position, position, heading)))
+
+
+class Alike(Protocol):
+    """How far scans that follow each other err together."""
+
+    @property
+    def way_alike(self) -> float: ...
+    @property
+    def turn_alike(self) -> float: ...
+    @property
+    def still(self) -> float: ...
+
+
+def new_share(driven: float, turned: float, alike: Alike) -> float:
+    """Return how much of a scan's evidence is new after a way (metres) and a turn (radians)."""
+    return min(driven / alike.way_alike + turned / alike.turn_alike + alike.still, 1.0)
 
 
 class Odometer:

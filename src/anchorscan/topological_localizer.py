@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
 from .matcher import Candidates, Trace
-from .motion import MotionSettings, Odometer
+from .motion import MotionSettings, Odometer, new_share
 from .pose import Pose2D
 from .reference import Reference
 from .scan import LaserScan
@@ -153,8 +153,8 @@ class TopologicalLocalizer:
         belief = left(self._belief, self._pairs, step.driven, settings)
         fits, poses = self._fits(scan)
         if fits is not None:
-            new = step.driven / settings.way_alike + step.turned / settings.turn_alike
-            belief = told(belief, fits, min(new + settings.still, 1.0), settings)
+            share = new_share(step.driven, step.turned, settings)
+            belief = told(belief, fits, share, settings)
         self._belief = belief
         return self._report(poses)
 
