@@ -308,8 +308,11 @@ def departures(
         journey = made[number]
         references = course.references(journey)
         begin = records[journey.positions[journey.jump or 0]].pose
+        if not _is_mapped(references, begin):
+            yield None
+            continue
         inside = _within(records, journey, references)
-        if not _is_mapped(references, begin) or _length(records, inside) < _SHORTEST:
+        if _length(records, inside) < _SHORTEST:
             yield None
             continue
         journey = journey if condition == "leaving" else inside
