@@ -16,20 +16,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
 
-from anchorscan import Matcher, Pose2D, Record, Reference, TopologicalLocalizer, open_log
+from anchorscan import Matcher, Pose2D, Record, Reference, TopologicalLocalizer
+from anchorscan.benchmark import read_drives
 from anchorscan.lost_robot import Course, Departure, departures
 
 _BESIDE = 3.0
-
-
-@dataclass(frozen=True)
-class Drive:
-    """A log, read."""
-
-    name: str
-    records: tuple[Record, ...]
-    building: str
-    recording: str
 
 
 @dataclass(frozen=True)
@@ -50,7 +41,7 @@ def main() -> None:
     parser.add_argument("--longest", type=float, default=100.0, help="metres")
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
-    drive = Drive(arguments.log, tuple(open_log(arguments.log)), "", "")
+    (drive,) = read_drives([arguments.log])
     course = Course(drive.name, drive, drive)
     made = departures(
         course, "noise", arguments.starts, longest=arguments.longest, seed=arguments.seed

@@ -14,29 +14,19 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 
-from anchorscan import LaserScan, Localizer, Matcher, Pose2D, Record, open_log
+from anchorscan import LaserScan, Localizer, Matcher, Pose2D, Record
 from anchorscan.belief import log_odds
+from anchorscan.benchmark import read_drives
 from anchorscan.lost_robot import Course, Departure, departures, follow
 from anchorscan.protocol import Answer
 
 _AROUND = 2.0
 # So firmly a pose is held that refining it moves it by centimetres at most.
 _FIRM = 1e3 * np.eye(3)
-
-
-@dataclass(frozen=True)
-class Drive:
-    """A log, read."""
-
-    name: str
-    records: tuple[Record, ...]
-    building: str
-    recording: str
 
 
 def main() -> None:
@@ -47,7 +37,7 @@ def main() -> None:
     parser.add_argument("--condition", default="noise")
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
-    drive = Drive(arguments.log, tuple(open_log(arguments.log)), "", "")
+    (drive,) = read_drives([arguments.log])
     course = Course(drive.name, drive, drive)
     count = 0
     print("start  confident and wrong at  metres off  at logged poses        so far off")
