@@ -903,6 +903,18 @@ def _solved(h, g, damping):  # type: ignore[no-untyped-def]
 
 
 @kernel
+def descended(pose, hessian, gradient):  # type: ignore[no-untyped-def]
+    """Move a (3,) pose by one damped step of 10 cm at most; tell whether it hardly moved."""
+    x, y, theta = _solved(hessian, gradient, 1.0)
+    size = math.hypot(x, y)
+    share = 1.0 if size < 0.1 else 0.1 / size
+    pose[0] -= share * x
+    pose[1] -= share * y
+    pose[2] -= share * theta
+    return size < 0.002 and abs(theta) < 0.0005
+
+
+@kernel
 def refined(pose, room, tiles, iterations):  # type: ignore[no-untyped-def]
     """Move a (3,) pose so that points lie on surfaces: damped Gauss-Newton, bounded steps."""
     moved = pose.copy()
@@ -910,13 +922,7 @@ def refined(pose, room, tiles, iterations):  # type: ignore[no-untyped-def]
         # From coarse to fine: wide weights first, so that the pose can still travel.
         scale = 0.2 if 2 * step < iterations else 0.1
         hessian, gradient, _, _ = normal_equations(moved, room, tiles, scale)
-        x, y, theta = _solved(hessian, gradient, 1.0)
-        size = math.hypot(x, y)
-        share = 1.0 if size < 0.1 else 0.1 / size
-        moved[0] -= share * x
-        moved[1] -= share * y
-        moved[2] -= share * theta
-        if size < 0.002 and abs(theta) < 0.0005 and 2 * step >= iterations:
+        if descended(moved, hessian, gradient) and 2 * step >= iterations:
             break
     return moved
 

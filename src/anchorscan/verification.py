@@ -34,7 +34,7 @@ from .angle_function import AngleFunction, wrapped
 from .field import (
     Tiles,
     Weights,
-    _solved,
+    descended,
     field_scores,
     look_up,
     normal_equations,
@@ -381,13 +381,7 @@ def _held_back(pose, k, room, tiles, iterations):  # type: ignore[no-untyped-def
             gradient[1] + k[1, 0] * off[0] + k[1, 1] * off[1] + k[1, 2] * off[2],
             gradient[2] + k[2, 0] * off[0] + k[2, 1] * off[1] + k[2, 2] * off[2],
         )
-        x, y, theta = _solved(hessian, gradient, 1.0)
-        size = math.hypot(x, y)
-        share = 1.0 if size < 0.1 else 0.1 / size
-        moved[0] -= share * x
-        moved[1] -= share * y
-        moved[2] -= share * theta
-        if size < 0.002 and abs(theta) < 0.0005 and 2 * step >= iterations:
+        if descended(moved, hessian, gradient) and 2 * step >= iterations:
             break
     moved[2] = wrapped(moved[2])
     return moved
