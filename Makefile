@@ -19,7 +19,7 @@ FUZZ_SECONDS ?= 3600
 
 .DEFAULT_GOAL := help
 .PHONY: help setup check test ros-test bench docs release demo picture lock clean
-.PHONY: fuzz test-lowest test-newest test-versions audit kernels kernels-default kernels-paper package
+.PHONY: fuzz test-lowest test-newest test-versions audit kernels package
 
 help: ## show this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-11s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -92,11 +92,10 @@ audit: setup ## look the pinned versions up among the known weaknesses; needs py
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check pip-audit
 	$(BIN)/pip-audit --strict --disable-pip --require-hashes -r requirements-dev.txt
 
-kernels: kernels-default kernels-paper ## compile the kernels once, so that processes side by side do not all do it
-
-kernels-default kernels-paper: kernels-%: setup
+kernels: setup ## compile the kernels once, so that processes side by side do not all do it
 	$(BIN)/python -c 'from anchorscan import Localizer, Matcher, Settings; \
-		places = Matcher((), Settings.preset("$*")); places.prepare(); Localizer(places).prepare()'
+		all_of = [Matcher((), Settings.preset(name)) for name in ("default", "paper")]; \
+		[each.prepare() for each in all_of]; Localizer(all_of[0]).prepare()'
 
 package: setup ## build both distributions and try the wheel in an empty environment
 	rm -rf dist $(VENV)-package
