@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import typer
 
 from anchorscan import (
     LaserScan,
@@ -621,3 +622,23 @@ def test_a_pipe_is_written_to_and_not_replaced(log: Path, places: Path, tmp_path
         lines = pipe.read_text(encoding="utf-8").splitlines()
     assert json.loads(lines[0])["scan"] == 0
     assert pipe.is_fifo()
+
+
+def test_ctrl_c_while_a_kernel_is_loaded_is_no_error_of_ours() -> None:
+    """Code in C that does not look for exceptions makes a SystemError of it."""
+    from anchorscan.commands.console import guarded
+
+    def interrupted() -> None:
+        try:
+            raise KeyboardInterrupt
+        except KeyboardInterrupt as error:
+            raise SystemError("returned a result with an exception set") from error
+
+    def broken() -> None:
+        raise SystemError("something else")
+
+    with pytest.raises(typer.Exit) as ended:
+        guarded(interrupted)()
+    assert ended.value.exit_code == 130
+    with pytest.raises(SystemError, match="something else"):
+        guarded(broken)()

@@ -44,7 +44,9 @@ def guarded(command: Command) -> Command:
             # Whoever read us (head, less) has seen enough; what is buffered has no reader.
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             raise typer.Exit(128 + signal.SIGPIPE) from None
-        except KeyboardInterrupt:
+        except (KeyboardInterrupt, SystemError) as error:
+            if not _is_interruption(error):
+                raise
             raise typer.Exit(128 + signal.SIGINT) from None
         except OSError as error:
             if error.filename is None and error.errno is None:
@@ -54,6 +56,13 @@ def guarded(command: Command) -> Command:
             raise typer.Exit(FAILED) from None
 
     return guarded  # type: ignore[return-value]
+
+
+def _is_interruption(error: BaseException | None) -> bool:
+    """Tell whether Ctrl-C is behind an error: while numba loads a kernel it ends in SystemError."""
+    while error is not None and not isinstance(error, KeyboardInterrupt):
+        error = error.__cause__ or error.__context__
+    return error is not None
 
 
 def say(message: str) -> None:
