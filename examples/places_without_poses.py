@@ -18,7 +18,7 @@ from itertools import combinations
 
 from anchorscan import Matcher, Pose2D, Record, Reference, TopologicalLocalizer
 from anchorscan.benchmark import read_drives
-from anchorscan.lost_robot import Course, Departure, departures
+from anchorscan.lost_robot import Course, Departure, departures, is_mapped
 
 _BESIDE = 3.0
 
@@ -79,18 +79,18 @@ def steps(records: Sequence[Record], departure: Departure) -> list[Step]:
         single.reset()
         alone = single.update(record.scan)
         truth = record.pose
-        if any(is_near(pose, truth, 2.0, 45.0) for pose in poses.values()):
+        if is_mapped(departure.references, truth):
             right, by_itself = (
-                one.reference is not None and is_near(poses[one.reference], truth, 3.0, 90.0)
+                one.reference is not None and is_right(poses[one.reference], truth)
                 for one in (belief, alone)
             )
             told.append(Step(right, by_itself, belief.accepted, seconds))
     return told
 
 
-def is_near(one: Pose2D, other: Pose2D, distance: float, degrees: float) -> bool:
-    """Whether two poses lie within metres and degrees."""
-    return one.distance(other) <= distance and one.turn(other) <= math.radians(degrees)
+def is_right(named: Pose2D, truth: Pose2D) -> bool:
+    """Whether a reference was taken within 3 m and 90 degrees of where the robot is."""
+    return named.distance(truth) <= _BESIDE and named.turn(truth) <= math.radians(90.0)
 
 
 if __name__ == "__main__":

@@ -14,13 +14,13 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
-from itertools import pairwise
 
 import numpy as np
 
 from anchorscan import LaserScan, Localizer, Matcher, Pose2D, Record
 from anchorscan.belief import log_odds
 from anchorscan.benchmark import read_drives
+from anchorscan.journey import metres_driven
 from anchorscan.lost_robot import Course, Departure, departures, follow
 from anchorscan.protocol import Answer
 
@@ -54,7 +54,8 @@ def told(records: Sequence[Record], departure: Departure) -> None:
     journey, matcher = departure.journey, Matcher(departure.references)
     answers = follow(records, journey, departure.odometry, Localizer(matcher))
     begin = journey.jump or 0
-    way = driven(answers[begin:])
+    along = metres_driven(records, journey)
+    way = [metres - along[begin] for metres in along[begin:]]
     least = -1.0 if journey.jump is None else 2.0
     wrong = [
         n
@@ -77,14 +78,6 @@ def told(records: Sequence[Record], departure: Departure) -> None:
         f"{departure.number:>5} {way[wrong[0]]:>20.1f} m {metres:>10.2f}"
         f" {at_log[0]:>11.2f} {at_log[1]:>6.1f} {beside[0]:>14.2f} {beside[1]:>6.1f}"
     )
-
-
-def driven(answers: Sequence[Answer]) -> list[float]:
-    """Metres along the logged poses."""
-    way = [0.0]
-    for before, now in pairwise(answers):
-        way.append(way[-1] + before.truth.distance(now.truth))
-    return way
 
 
 def error(answer: Answer) -> Pose2D:

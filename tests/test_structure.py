@@ -23,7 +23,7 @@ ROOT = PACKAGE.parents[1]
 ORDER = (
     *("errors", "progress", "cluster", "pose", "scan", "record", "reference"),
     *("regression", "protocol", "journey"),
-    *("array_file", "_jit", "covariance"),
+    *("array_file", "_jit", "ranking", "covariance"),
     *("angle_function", "segments", "anchors", "graph"),
     *("length_relation", "oriented_relation", "database", "panorama", "alignment"),
     *("evidence", "field", "proposal", "verification", "evaluation", "hypothesis", "decision"),

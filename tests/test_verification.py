@@ -33,7 +33,6 @@ from anchorscan.verification import (
     worth,
 )
 from anchorscan.verification import _distinct as distinct
-from anchorscan.verification import _highest as highest
 
 FIELD = Settings.preset("default").field
 WEIGHTS = FIELD.weights()
@@ -324,9 +323,3 @@ def test_some_of_the_fits():
     np.testing.assert_array_equal(some.poses, rows[1:3])
     assert some.residuals.tolist() == [1.0, 2.0]
     assert some.readings == 90
-
-
-@given(st.lists(st.integers(-9, 9), max_size=60), st.integers(1, 40))
-def test_the_highest_scores_come_first_and_of_equals_the_first(scores, most):
-    expected = sorted(range(len(scores)), key=lambda k: (-scores[k], k))[:most]
-    assert highest(np.array(scores, float), most).tolist() == expected

@@ -37,6 +37,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from ._jit import kernel
 from .graph import AnchorGraph, GraphStack
+from .ranking import best_first
 
 __all__ = ["Alignment", "AlignmentSettings", "Correspondences", "align", "correspondences"]
 
@@ -565,19 +566,6 @@ def _spread(group, inside, mean, scatter):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _by_support(support, begin, end):  # type: ignore[no-untyped-def]
-    """The alignments of one candidate, the best supported first; equals keep their order."""
-    order = np.arange(begin, end)
-    for k in range(1, end - begin):
-        n = order[k]
-        while k > 0 and support[order[k - 1]] < support[n]:
-            order[k] = order[k - 1]
-            k -= 1  # noqa: PLW2901
-        order[k] = n
-    return order
-
-
-@kernel
 def _distinct(poses, support, candidates, size):  # type: ignore[no-untyped-def]
     """Alignments that differ, candidate after candidate, the best supported of equals."""
     chosen = np.empty(len(poses), np.int64)
@@ -587,7 +575,8 @@ def _distinct(poses, support, candidates, size):  # type: ignore[no-untyped-def]
         begin, first = end, found
         while end < len(poses) and candidates[end] == candidates[begin]:
             end += 1
-        for n in _by_support(support, begin, end):
+        for k in best_first(support[begin:end], end - begin):
+            n = begin + k
             new = support[n] > 0
             for other in chosen[first:found]:
                 if _apart(poses[n], poses[other], size) <= 1.0:

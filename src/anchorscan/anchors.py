@@ -48,6 +48,7 @@ from .angle_function import (
     line_through,
     wrapped,
 )
+from .ranking import best_first
 from .scan import LaserScan
 from .segments import Segments, SegmentSettings, segments
 
@@ -558,8 +559,7 @@ def _walls(histograms, limits, facing):  # type: ignore[no-untyped-def]
             rows[found, 1] = (1.0 - 2.0 * side) if facing else 0.0
             rows[found, 2] = total
             found += 1
-    order = np.argsort(-rows[:found, 2], kind="mergesort")[:most]
-    return rows[order]
+    return rows[best_first(rows[:found, 2], most)]
 
 
 @kernel

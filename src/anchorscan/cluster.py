@@ -102,9 +102,7 @@ class Spread:
             AnchorscanError: The first known error that one of them ended with.
         """
         holders = [Holder(make, item, n, self._client) for n, item in enumerate(items)]
-        asked = [holder.ask(_nothing, None) for holder in holders]
-        for holder, one in zip(holders, asked, strict=True):
-            holder.answer(_nothing, None, one)
+        list(self.ask(_nothing, holders, [None]))
         return holders
 
     def ask(

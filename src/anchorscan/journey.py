@@ -25,6 +25,7 @@ __all__ = [
     "RecoveryFigures",
     "independent",
     "journeys",
+    "metres_driven",
     "odometry",
     "recovery",
     "summary",
@@ -134,7 +135,7 @@ def independent(
         gap: Metres of driving before the first and after the last record of each of its parts.
     """
     usable = [i for i, r in enumerate(records) if r.scan is not None and _has_pose(r)]
-    along = dict(zip(usable, _driven(records, Journey(tuple(usable))), strict=True))
+    along = dict(zip(usable, metres_driven(records, Journey(tuple(usable))), strict=True))
     parts = [journey.positions[: journey.jump], journey.positions[journey.jump or 0 :]]
     spans = [(along[part[0]] - gap, along[part[-1]] + gap) for part in parts if part]
     return tuple(
@@ -188,7 +189,7 @@ def recovery(records: Sequence[Record], journey: Journey, reports: Sequence[Answ
     """
     if len(reports) != len(journey.positions):
         raise ValueError(f"{len(journey.positions)} records need as many reports: {len(reports)}")
-    driven = _driven(records, journey)
+    driven = metres_driven(records, journey)
     begin = journey.jump or 0
     metres = [along - driven[begin] for along in driven[begin:]] if driven else []
     later = list(zip(metres, reports[begin:], strict=True))
@@ -230,7 +231,7 @@ def _ended(records: Sequence[Record], positions: Sequence[int], longest: float) 
     journey = Journey(tuple(positions))
     if math.isinf(longest):
         return journey
-    within = [metres <= longest for metres in _driven(records, journey)]
+    within = [metres <= longest for metres in metres_driven(records, journey)]
     return Journey(
         tuple(position for position, near in zip(positions, within, strict=True) if near)
     )
@@ -283,8 +284,8 @@ def _is_far(report: Answer) -> bool:
     )
 
 
-def _driven(records: Sequence[Record], journey: Journey) -> list[float]:
-    """Return the metres driven up to each record; being carried is not driving."""
+def metres_driven(records: Sequence[Record], journey: Journey) -> list[float]:
+    """Return the metres driven up to each record of a journey; being carried is not driving."""
     poses = [_pose(records[position]) for position in journey.positions]
     driven = [0.0] * min(len(poses), 1)
     for index in range(1, len(poses)):

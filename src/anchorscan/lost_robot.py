@@ -52,6 +52,7 @@ __all__ = [
     "courses",
     "departures",
     "follow",
+    "is_mapped",
     "run",
 ]
 
@@ -308,7 +309,7 @@ def departures(
         journey = made[number]
         references = course.references(journey)
         begin = records[journey.positions[journey.jump or 0]].pose
-        if not _is_mapped(references, begin):
+        if not is_mapped(references, begin):
             yield None
             continue
         inside = _within(records, journey, references)
@@ -380,7 +381,7 @@ def _within(
     left, before = 0.0, None
     for index in range(journey.jump or 0, len(journey.positions)):
         pose = records[journey.positions[index]].pose
-        if pose is None or _is_mapped(references, pose):
+        if pose is None or is_mapped(references, pose):
             left = 0.0
         elif before is not None:
             left += before.distance(pose)
@@ -397,7 +398,8 @@ def _length(records: Sequence[Record], journey: Journey) -> float:
     return sum(a.distance(b) for a, b in pairwise(known))
 
 
-def _is_mapped(references: Sequence[Reference], pose: Pose2D | None) -> bool:
+def is_mapped(references: Sequence[Reference], pose: Pose2D | None) -> bool:
+    """Tell whether a reference was taken within 2 m and 45 degrees of a pose."""
     return pose is not None and any(
         each.pose is not None
         and each.pose.distance(pose) <= _NEAR

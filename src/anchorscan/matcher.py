@@ -257,7 +257,7 @@ class Matcher:
         """Compile and derive what a search needs, so that the first real scan does not pay for it.
 
         What references like these need, or, where there are none, what any could.  Once for an
-        installation that takes about a minute, as long as numba's cache lasts.
+        installation that takes one or two minutes, as long as numba's cache lasts.
         """
         places = Matcher((), self.settings)
         if self._map or not self._singles:

@@ -236,15 +236,14 @@ def scale_check(places: _Places, scans: Iterable[LaserScan]) -> ScaleCheck:
     as_given, _ = _fitting(places, scans, 1.0)
     if len(scans) < _FEWEST:
         return ScaleCheck(len(scans), as_given, 1.0, as_given)
-    near = _best_scored(places, scans, _scales(1.0, _NEAR_SCALES, _NEAR_STEPS))
-    near = _best_scored(places, scans, _scales(near, _NEAR_STEPS, _FINE_STEP))
-    located, _ = _fitting(places, scans, near)
+    near, _ = _best_scored(places, scans, _scales(1.0, _NEAR_SCALES, _NEAR_STEPS))
+    near, located = _best_scored(places, scans, _scales(near, _NEAR_STEPS, _FINE_STEP))
     if as_given > _THIRD * len(scans) or located > _THIRD * len(scans):
         return ScaleCheck(len(scans), as_given, near, located)
     some = scans[::_SOME]
     wide = _scales(1.0, math.log(_LARGEST_SCALE), _SCALE_STEP)
     scale = max(wide, key=lambda each: _fitting(places, some, each))
-    scale = _best_scored(places, some, _scales(scale, _SCALE_STEP, _FINE_STEP))
+    scale, _ = _best_scored(places, some, _scales(scale, _SCALE_STEP, _FINE_STEP))
     return ScaleCheck(len(scans), as_given, scale, _fitting(places, scans, scale)[0])
 
 
@@ -254,8 +253,11 @@ def _scales(middle: float, reach: float, step: float) -> list[float]:
     return [middle * math.exp(step * k) for k in range(-steps, steps + 1)]
 
 
-def _best_scored(places: _Places, scans: list[LaserScan], scales: list[float]) -> float:
-    return max(scales, key=lambda each: _fitting(places, scans, each)[1])
+def _best_scored(places: _Places, scans: list[LaserScan], scales: list[float]) -> tuple[float, int]:
+    """Return the scale of the highest scores, and how many scans are located at it."""
+    fitting = {scale: _fitting(places, scans, scale) for scale in scales}
+    best = max(scales, key=lambda scale: fitting[scale][1])
+    return best, fitting[best][0]
 
 
 def _fitting(places: _Places, scans: Iterable[LaserScan], scale: float) -> tuple[int, float]:

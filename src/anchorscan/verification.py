@@ -45,6 +45,7 @@ from .field import (
     score_of,
 )
 from .proposal import spread
+from .ranking import best_first
 from .segments import is_small
 
 __all__ = [
@@ -246,28 +247,10 @@ def _sieve(poses, readings, tiles, weights, sieves):  # type: ignore[no-untyped-
     """The best distinct poses by more and more readings."""
     second, third, most, fits, distance, turn = sieves
     scores = field_scores(poses, spread(readings, second), tiles, weights)
-    best = poses[_highest(scores, most)]
+    best = poses[best_first(scores, most)]
     scores = field_scores(best, spread(readings, third), tiles, weights)
-    best = best[_highest(scores, most)]
+    best = best[best_first(scores, most)]
     return best[_distinct(best, distance, turn, fits)]
-
-
-@kernel
-def _highest(scores, most):  # type: ignore[no-untyped-def]
-    """Indices of the ``most`` highest scores, the highest first; of equals the first."""
-    best = np.empty(min(most, len(scores)), np.int64)
-    found = 0
-    for i in range(len(scores)):
-        if found < len(best):
-            found += 1
-        elif not scores[i] > scores[best[found - 1]]:
-            continue
-        k = found - 1
-        while k > 0 and scores[best[k - 1]] < scores[i]:
-            best[k] = best[k - 1]
-            k -= 1
-        best[k] = i
-    return best
 
 
 @kernel
@@ -325,7 +308,7 @@ def _fit(poses, readings, tiles, weights, steps, places, rays):  # type: ignore[
         _features(moved[k], many, small, tiles, weights, features[k])
         features[k, 5] = passed_through(moved[k], followed, tiles, rays[1])
         worths[k] = worth(features[k, 0], features[k, 5])
-    order = _highest(worths, count)
+    order = best_first(worths, count)
     order = order[_distinct(moved[order], places[0], places[1], count)]
     moved, features = moved[order], features[order]
     hessians = np.empty((len(order), 3, 3))
