@@ -109,6 +109,18 @@ def test_a_lost_robot_is_found_by_the_command_and_the_table_is_kept(tmp_path):
     assert kept[0]["reliability"]["counts"] == outcomes[0].reliability.counts.tolist()
 
 
+def test_windows_are_measured_beside_single_scans():
+    drives = [driven("known", 1, length=90.0), driven("asked", 2, length=25.0)]
+    outcomes = run(drives, ("anchorscan", "window"), starts=2, longest=20.0)
+    by_follower = {(one.follower, one.condition): one for one in outcomes}
+    for name in ("anchorscan", "window"):
+        one = by_follower[name, "recorded"]
+        assert one.figures.found == 1.0
+        assert one.figures.was_wrong == 0.0
+    single, window = (by_follower[name, "recorded"] for name in ("anchorscan", "window"))
+    assert window.reliability.error != single.reliability.error
+
+
 def test_a_place_that_is_visited_once_has_no_course():
     with pytest.raises(AnchorscanError, match="no journey starts within a map"):
         run([driven("a", 1, length=5.0)], ("anchorscan",))
