@@ -340,6 +340,16 @@ def test_karto_is_left_out_with_a_word_where_it_is_not_installed(monkeypatch):
     assert "anchorscan[bench]" in said[0]
 
 
+def test_drives_can_be_read_as_a_laser_saw_them_that_sees_less_far(tmp_path):
+    log = carmen_log(tmp_path / "lab.log", 3)
+    (far,), (near,) = read_drives([log]), read_drives([log], 2.5)
+    for record, shorter in zip(far.records, near.records, strict=True):
+        ranges = record.scan.ranges
+        seen = ranges[record.scan.is_return & (ranges < 2.5)]
+        assert np.array_equal(shorter.scan.ranges[shorter.scan.is_return], seen)
+    assert any(np.any(record.scan.ranges >= 2.5) for record in far.records)
+
+
 def test_logs_are_named_without_their_endings(tmp_path):
     log = carmen_log(tmp_path / "lab.log", 3)
     other = carmen_log(tmp_path / "hall.log", 4)

@@ -26,7 +26,16 @@ ORDER = (
     *("array_file", "_jit", "ranking", "covariance"),
     *("angle_function", "segments", "anchors", "graph"),
     *("length_relation", "oriented_relation", "database", "panorama", "alignment"),
-    *("evidence", "field", "proposal", "verification", "evaluation", "hypothesis", "decision"),
+    *(
+        "evidence",
+        "field",
+        "proposal",
+        "standing",
+        "verification",
+        "evaluation",
+        "hypothesis",
+        "decision",
+    ),
     *("motion", "belief", "settings"),
     *("description", "pairwise", "placed", "stitched_map", "matcher"),
     *(

@@ -246,6 +246,7 @@ def run(
     say: Callable[[str], None] = lambda line: None,
     progress: ProgressOf = lambda items, what, total=None: items,
     spread: Spread | None = None,
+    range_max: float | None = None,
 ) -> Scoreboard:
     """Measure presets and baselines by the protocols, and keep what was found.
 
@@ -266,6 +267,8 @@ def run(
         progress: Wraps what takes a while.
         spread: Shares the queries among workers, which must find the logs under the same paths;
             None asks them all here.  The answers are the same, but for their times.
+        range_max: From this range on, metres, a reading of a query or a reference means "no
+            return", as if a laser that sees no farther had been there; None for the logs' own.
 
     A log that cannot be read is named, and the others are measured.
 
@@ -282,6 +285,7 @@ def run(
         "seed": seed,
         "baselines": list(baselines),
         "baseline_queries": baseline_queries,
+        "range_max": range_max,
     }
     _check(protocols, PROTOCOLS, "protocol")
     _check(baselines, BASELINES, "baseline")
@@ -291,7 +295,7 @@ def run(
         *_baseline_methods(baselines, baseline_queries, say),
     ]
     paths = list(logs) or default_logs(say)
-    drives, unread = _readable(progress(paths, "reading", len(paths)), len(paths))
+    drives, unread = _readable(progress(paths, "reading", len(paths)), len(paths), range_max)
     todo = tasks(drives, protocols)
     for drive in drives:
         if not any(drive in (task.known, task.asked) for task in todo):
@@ -310,6 +314,7 @@ def run(
             tuple(candidates),
             tuple(baselines),
             baseline_queries,
+            range_max,
         )
         scores = _measure_spread(plan, todo, methods, queries, seed, progress, spread)
     if spread is not None:
@@ -383,8 +388,12 @@ def _some(paths: list[Path]) -> list[Path]:
     return paths
 
 
-def read_drives(logs: Iterable[str | Path]) -> list[Drive]:
+def read_drives(logs: Iterable[str | Path], range_max: float | None = None) -> list[Drive]:
     """Read logs, each a path or "BUILDING=PATH".
+
+    Args:
+        logs: The logs.
+        range_max: From this range on, metres, a reading means "no return"; None for the logs' own.
 
     Raises:
         LogError: A log cannot be read.
@@ -398,7 +407,7 @@ def read_drives(logs: Iterable[str | Path]) -> list[Drive]:
             raise AnchorscanError(f"two logs are called {name}: rename one of them")
         drives[name] = Drive(
             name,
-            tuple(open_log(path)),
+            tuple(open_log(path, range_max=range_max)),
             building or _SAME_BUILDING.get(name, name),
             _SAME_RECORDING.get(name, name),
             path,
@@ -406,7 +415,9 @@ def read_drives(logs: Iterable[str | Path]) -> list[Drive]:
     return list(drives.values())
 
 
-def _readable(logs: Iterable[str | Path], count: int) -> tuple[list[Drive], dict[str, str]]:
+def _readable(
+    logs: Iterable[str | Path], count: int, range_max: float | None
+) -> tuple[list[Drive], dict[str, str]]:
     """Read the logs that can be read; give the reasons for the others by their names.
 
     Raises:
@@ -417,7 +428,7 @@ def _readable(logs: Iterable[str | Path], count: int) -> tuple[list[Drive], dict
     unread: dict[str, str] = {}
     for log in logs:
         try:
-            (drive,) = read_drives([log])
+            (drive,) = read_drives([log], range_max)
         except LogError as error:
             if count == 1:
                 raise
@@ -537,6 +548,7 @@ class _Plan:
     candidates: tuple[Candidates, ...]
     baselines: tuple[str, ...]
     baseline_queries: int | None
+    range_max: float | None
 
 
 @dataclass(frozen=True)
@@ -582,7 +594,7 @@ def _planned(plan: _Plan) -> tuple[list[Task], list[Method]]:
         *preset_methods(settings, plan.candidates),
         *_baseline_methods(plan.baselines, plan.baseline_queries, lambda line: None),
     ]
-    return tasks(read_drives(plan.logs), plan.protocols), methods
+    return tasks(read_drives(plan.logs, plan.range_max), plan.protocols), methods
 
 
 @lru_cache(maxsize=2)

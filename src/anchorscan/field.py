@@ -691,6 +691,15 @@ def cell_code(tiles, cx, cy):  # type: ignore[no-untyped-def]
 
 
 @kernel
+def is_clear(x, y, tiles, distance):  # type: ignore[no-untyped-def]
+    """Whether a position is known free space, so far from all surfaces."""
+    cx = int(math.floor(x / tiles.resolution)) - tiles.column
+    cy = int(math.floor(y / tiles.resolution)) - tiles.row
+    code = cell_code(tiles, cx, cy)
+    return code & _FREE != 0 and (code & _FAR) * tiles.reach >= distance * _FAR
+
+
+@kernel
 def coarse_score(tiles, cx, cy):  # type: ignore[no-untyped-def]
     """Best score (127ths) in a coarse cell of the table; 0 beyond its border."""
     u = np.uint64(min(max(cx, 0), (tiles.width << 10) - 1))

@@ -39,6 +39,7 @@ __all__ = [
     "ProposalSettings",
     "Proposals",
     "check_landmarks",
+    "checked",
     "joined",
     "landmarks",
     "proposals",
@@ -336,6 +337,36 @@ def proposals(
     if found < settings.enough:
         for lot in lots:
             found = _lone_proposals(query, lot, limits, out, found)
+    return _passing(out, found, points, tiles, settings)
+
+
+def checked(
+    poses: NDArray[np.float64],
+    points: NDArray[np.float64],
+    tiles: Tiles,
+    settings: ProposalSettings,
+) -> Proposals:
+    """Keep those of (P, 3) poses at which a few readings may fit.
+
+    Args:
+        poses: T_set_laser, metres and radians.
+        points: (N, 2) or more columns, end points of the returns to check with, metres, scan
+            frame.
+        tiles: The map.
+        settings: How many readings and proposals.
+    """
+    units = np.mod(np.round(poses[:, 2] * (_TURN / (2.0 * math.pi))), _TURN)
+    return _passing(np.column_stack((poses[:, :2], units)), len(poses), points, tiles, settings)
+
+
+def _passing(
+    out: NDArray[np.float64],
+    found: int,
+    points: NDArray[np.float64],
+    tiles: Tiles,
+    settings: ProposalSettings,
+) -> Proposals:
+    """Those of the first poses, with headings in 65,536ths of a turn, that pass the first check."""
     chosen = spread(points, settings.readings)
     poses, scores = _checked(chosen, tiles, out, found, settings.most)
     return Proposals(poses, scores, found)

@@ -7,12 +7,11 @@ that an answer can name the reference scan that it stands for.
 
 from __future__ import annotations
 
-import math
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import reduce
+from functools import cached_property, reduce
 from queue import SimpleQueue
 from typing import Any, TypeVar
 
@@ -43,13 +42,15 @@ from .proposal import (
 from .reference import Reference
 from .scan import LaserScan
 from .settings import Settings
-from .verification import Fits, follow, on_large, readings, verify
+from .standing import Places, places, standing
+from .verification import Fits, follow, on_large, readings, settled, verify
 
 __all__ = ["MapSearch", "StitchedMap"]
 
 # What is known of so many references, some fifty megabytes, is kept; of others it is made again.
 _REMEMBERED = 4096
-_MOST_STANDING = 2048
+# Around so many references a scan without anchor points may stand.
+_MOST_STANDING = 1024
 
 Value = TypeVar("Value")
 Other = TypeVar("Other")
@@ -108,6 +109,20 @@ class _Content:
     def landmarks(self) -> list[Landmarks]:
         """Those of all references."""
         return [lot.landmarks for lot in self.lots]
+
+    @cached_property
+    def places(self) -> Places:
+        """Where a scan without anchor points may stand; of very many references around some."""
+        there = [lot.is_there for lot in self.lots]
+        poses, walls = (
+            np.concatenate([each[here] for each, here in zip(arrays, there, strict=True)])
+            for arrays in (
+                [lot.poses for lot in self.lots],
+                [lot.anchors.main_angles for lot in self.lots],
+            )
+        )
+        step = -(-len(poses) // _MOST_STANDING) or 1
+        return places(poses[::step], walls[::step], self.tiles)
 
 
 class StitchedMap:
@@ -308,9 +323,12 @@ class StitchedMap:
         votes = None if most is None else self._candidates(description, most, content)
         related = content.landmarks if votes is None else self._some(votes.references, content)
         proposed = proposals(description.anchors, large, related, tiles, settings.proposal)
-        if not len(proposed.poses):
-            proposed = _standing(content)
-        fits = verify(proposed.poses, seen, tiles, self._weights, settings.verification)
+        poses = proposed.poses
+        if not len(poses):
+            walls = description.anchors.main_angle
+            proposed = standing(content.places, walls, large, tiles, settings.proposal)
+            poses = settled(proposed.poses, seen, tiles, settings.verification)
+        fits = verify(poses, seen, tiles, self._weights, settings.verification)
         return votes, proposed, fits
 
     def _hypotheses(
@@ -482,17 +500,6 @@ def _lot_from(arrays: Mapping[str, NDArray[Any]], settings: Settings) -> Lot:
         check_landmarks(stored)
         lot.__dict__["landmarks"] = stored
     return lot
-
-
-def _standing(content: _Content) -> Proposals:
-    """Return poses of references: a scan without anchors may stand at any.
-
-    Of very many, some: such a scan says nothing anyway.
-    """
-    step = -(-content.count // _MOST_STANDING) or 1
-    poses = np.concatenate([lot.poses[::step][lot.is_there[::step]] for lot in content.lots])
-    poses = np.concatenate([poses, poses + np.array([0.0, 0.0, math.pi])])
-    return Proposals(poses, np.zeros(len(poses)), len(poses))
 
 
 def _placed(reference: Reference) -> tuple[LaserScan, Pose2D]:

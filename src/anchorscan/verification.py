@@ -56,6 +56,7 @@ __all__ = [
     "follow",
     "on_large",
     "readings",
+    "settled",
     "verify",
     "worth",
 ]
@@ -202,6 +203,25 @@ def verify(
     return Fits(poses, features, hessians, residuals, count)
 
 
+def settled(
+    poses: NDArray[np.float64],
+    seen: NDArray[np.float64],
+    tiles: Tiles,
+    settings: VerificationSettings,
+) -> NDArray[np.float64]:
+    """Move (P, 3) poses that no relation holds until some readings lie on surfaces.
+
+    Args:
+        poses: T_set_laser, metres and radians.
+        seen: (N, 3) readings of the scan, see ``readings``.
+        tiles: The stitched map.
+        settings: The second check's readings are taken, and half of the steps of a fit.
+    """
+    steps = (settings.second_readings, settings.iterations // 2)
+    moved: NDArray[np.float64] = _settled(poses, seen, tiles, steps)
+    return moved
+
+
 def follow(
     poses: NDArray[np.float64],
     stiffness: NDArray[np.float64],
@@ -251,6 +271,16 @@ def _sieve(poses, readings, tiles, weights, sieves):  # type: ignore[no-untyped-
     scores = field_scores(best, spread(readings, third), tiles, weights)
     best = best[best_first(scores, most)]
     return best[_distinct(best, distance, turn, fits)]
+
+
+@kernel
+def _settled(poses, readings, tiles, steps):  # type: ignore[no-untyped-def]
+    """Every pose, refined with a few readings in a few steps."""
+    room = room_for(spread(readings, steps[0]))
+    moved = np.empty(poses.shape)
+    for k in range(len(poses)):
+        moved[k] = refined(poses[k], room, tiles, steps[1])
+    return moved
 
 
 @kernel

@@ -87,6 +87,7 @@ def bench(
         int, typer.Option(min=1, metavar="N", help="The same for the baselines, which are slow.")
     ] = 136,
     seed: Annotated[int, typer.Option(help="Chooses the queries, where not all are asked.")] = 0,
+    range_max: RangeMaxOption = None,
     *,
     sharing: SharingOptions,
 ) -> None:
@@ -98,7 +99,7 @@ def bench(
     from ..benchmark import BASELINES, PROTOCOLS, run
 
     if protocols and "P5" in protocols:
-        _bench_lost_robot(logs, baselines, queries, baseline_queries, seed, output)
+        _bench_lost_robot(logs, baselines, queries, baseline_queries, seed, output, range_max)
         protocols = [protocol for protocol in protocols if protocol != "P5"]
         if not protocols:
             return
@@ -118,6 +119,7 @@ def bench(
             say=typer.echo,
             progress=progress,
             spread=spread,
+            range_max=range_max,
         )
 
 
@@ -128,6 +130,7 @@ def _bench_lost_robot(
     baseline_starts: int,
     seed: int,
     output: Path | None,
+    range_max: float | None,
 ) -> None:
     """Measure P5 on the logs that were named, else on those with odometry and on Killian Court."""
     from ..benchmark import default_drives, read_drives
@@ -136,7 +139,7 @@ def _bench_lost_robot(
     paths = logs or default_drives(typer.echo)
     others = [name for name in ("window", "amcl") if name in (baselines or ["amcl"])]
     run(
-        read_drives(progress(paths, "reading", len(paths))),
+        read_drives(progress(paths, "reading", len(paths)), range_max),
         ("anchorscan", *others),
         starts=starts,
         baseline_starts=baseline_starts,
