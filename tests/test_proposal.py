@@ -81,8 +81,7 @@ def numbers_of(limits):
         int(limits.direction_tolerance / UNIT),
         int(limits.heading_tolerance / UNIT),
         int(limits.lone_heading_tolerance / UNIT),
-        limits.enough,
-        limits.most,
+        limits.most_edges,
     )
 
 
@@ -201,10 +200,14 @@ def plain_edge_proposals(anchors, known, limits, slack):
     """Every pose that lays an edge of the scan on a known one of its kind, length and turn."""
     kinds = np.repeat(np.arange(len(AnchorKind)), np.diff(known.starts[0]))
     poses = []
+    between = [math.dist(a, b) for a, b in itertools.combinations(anchors.positions, 2)]
+    within = [d for d in between if limits.shortest_edge <= d <= limits.longest_edge]
+    steps = sorted({0, *(int(64 * d) + 1 for d in within)})
+    shortest = next(n for n in steps if sum(64 * d >= n for d in within) <= limits.most_edges) / 64
     for i, j in itertools.permutations(range(len(anchors)), 2):
         a, b = anchors.positions[i], anchors.positions[j]
         length, bearing = math.dist(a, b), math.atan2(*(b - a)[::-1])
-        if not limits.shortest_edge <= length <= limits.longest_edge:
+        if not max(shortest, limits.shortest_edge) <= length <= limits.longest_edge:
             continue
         for e, (u, v) in enumerate(known.edges.tolist()):
             if (kinds[u], kinds[v]) != (anchors.kinds[i], anchors.kinds[j]):
@@ -292,6 +295,15 @@ def planted(rng, count, main):
 def test_edges_propose_what_the_twin_proposes(seed, count, main):
     scan, known, _ = planted(np.random.default_rng(seed), count, main)
     same_proposals(edge_proposals, plain_edge_proposals, scan, known, LIMITS)
+
+
+@given(seeds, st.integers(1, 30))
+@settings(max_examples=40)
+def test_of_very_many_edges_the_longest_propose(seed, most):
+    scan, known, _ = planted(np.random.default_rng(seed), 9, None)
+    limits = LIMITS.model_copy(update={"most_edges": most})
+    some = same_proposals(edge_proposals, plain_edge_proposals, scan, known, limits)
+    assert some <= same_proposals(edge_proposals, plain_edge_proposals, scan, known, LIMITS)
 
 
 @given(seeds, st.integers(2, 9), st.sampled_from([None, math.nan]))

@@ -60,6 +60,8 @@ _HEADING_COSINE, _HEADING_SINE = np.cos(_HEADING), np.sin(_HEADING)
 # A proposal in the same cell of position as one before it is the same.
 _CELL = 0.12
 _MOST = 1 << 16
+# Edges are sorted out by their length in steps of this, metres.
+_LENGTHS = 1.0 / 64.0
 _1 = np.uint64(1)
 
 
@@ -80,6 +82,7 @@ class ProposalSettings(BaseModel):
     lone_heading_tolerance: float = Field(
         math.radians(25.0), gt=0.0, description="lone anchor to main angles, radians"
     )
+    most_edges: int = Field(400, ge=1, description="edges of a scan that propose, the longest")
     enough: int = Field(300, ge=0, description="with so many from edges no lone anchors")
     readings: int = Field(12, ge=4, description="readings of the first check")
     most: int = Field(250, ge=1, description="proposals that pass the first check")
@@ -328,6 +331,7 @@ def proposals(
         int(settings.direction_tolerance * unit),
         int(settings.heading_tolerance * unit),
         int(settings.lone_heading_tolerance * unit),
+        settings.most_edges,
     )
     lots = [known] if isinstance(known, Landmarks) else known
     out = np.empty((_MOST, 3))
@@ -470,15 +474,38 @@ def _put(out, found, anchor, landmark, units):  # type: ignore[no-untyped-def]
 
 
 @kernel
+def _shortest(positions, limits):  # type: ignore[no-untyped-def]
+    """Length from which edges propose: of very many the longest, of which the map has least."""
+    shortest, longest, most = limits[0], limits[1], limits[6]
+    count = len(positions)
+    if count * (count - 1) // 2 <= most:
+        return shortest
+    counts = np.zeros(min(int(longest / _LENGTHS) + 1, _MOST), np.int64)
+    for i in range(count):
+        for j in range(i + 1, count):
+            dx, dy = positions[j, 0] - positions[i, 0], positions[j, 1] - positions[i, 1]
+            length = math.sqrt(dx * dx + dy * dy)
+            if shortest <= length <= longest:
+                counts[min(int(length / _LENGTHS), len(counts) - 1)] += 1
+    least = len(counts)
+    room = most
+    while least > 0 and counts[least - 1] <= room:
+        least -= 1
+        room -= counts[least]
+    return max(shortest, least * _LENGTHS)
+
+
+@kernel
 def _edge_proposals(query, known, limits, out, found):  # type: ignore[no-untyped-def]
     """Poses proposed by corresponding oriented edges; appended to ``out`` as long as they fit."""
     positions, kinds, directions, main = query
+    shortest = _shortest(positions, limits)
     for i in range(len(kinds)):
         for j in range(i + 1, len(kinds)):
             a, b = (i, j) if kinds[i] <= kinds[j] else (j, i)
             dx, dy = positions[b, 0] - positions[a, 0], positions[b, 1] - positions[a, 1]
             length = math.sqrt(dx * dx + dy * dy)
-            if length < limits[0] or length > limits[1]:
+            if length < shortest or length > limits[1]:
                 continue
             bearing = math.atan2(dy, dx)
             middle = (positions[a, 0] + 0.5 * dx, positions[a, 1] + 0.5 * dy)
