@@ -364,6 +364,7 @@ anchorscan.stitched_map.landmarks = None  # derived already, or this would be ca
 for record in records:
     localizer.update(record.scan, record.odometry, record.stamp)
 assert len(localizer.mixture)
+assert places.locate(anchorscan.LaserScan([2.0, 2.0], 0.0, 0.01))  # of no anchor point
 print(before, compiled())
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

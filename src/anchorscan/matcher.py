@@ -267,6 +267,7 @@ class Matcher:
         for candidates in (1, "all"):
             for hypothesis in (trace := places.explain(_ROOM, candidates)).hypotheses[:1]:
                 trace.evaluation(hypothesis)
+        places.explain(_CORNERLESS)
         self.explain(_ROOM)  # what is derived from these references when they are first searched
 
     def _know(self, reference: Reference) -> Known:
@@ -310,3 +311,6 @@ _ROOM = LaserScan.from_field_of_view(
     ],
     math.pi,
 )
+
+# No anchor point, so that it may stand anywhere.
+_CORNERLESS = LaserScan.from_field_of_view([2.0, 2.0, 2.0], math.radians(2.0))
