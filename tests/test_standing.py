@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import replace
 
@@ -9,7 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scans import FULL_TURN, box, building, drawn
+from scans import FULL_TURN, box, building, drawn, seeds
 
 from anchorscan import Matcher, Pose2D, Reference, Settings, simulate
 from anchorscan.anchors import AnchorPoints
@@ -18,6 +19,7 @@ from anchorscan.field import FieldSettings, LikelihoodField
 from anchorscan.pairwise import Known
 from anchorscan.proposal import ProposalSettings
 from anchorscan.standing import Places, places, standing
+from anchorscan.standing import _cells_around as cells_around
 from anchorscan.stitched_map import StitchedMap
 
 ROOM = box(-3.0, -2.0, 5.0, 2.0)
@@ -149,3 +151,18 @@ def test_two_ends_of_a_plain_corridor_are_no_answer():
     best = matcher.locate(scan)[0]
     assert abs(best.pose.y - 0.1) < 0.05
     assert not best.accepted
+
+
+@given(seeds, st.integers(1, 6))
+def test_cells_around_are_what_the_twin_finds(seed, count):
+    rng = np.random.default_rng(seed)
+    poses, reach = rng.uniform(-9.0, 9.0, (count, 3)), rng.uniform(0.5, 5.0)
+    cells, nearest = cells_around(poses, reach)
+    wanted = {}
+    for u, v in itertools.product(range(-16, 17), repeat=2):
+        far = np.hypot(u - poses[:, 0], v - poses[:, 1])
+        if far.min() <= reach:
+            wanted[u, v] = int(np.argmin(far))
+    found = zip(map(tuple, cells.tolist()), nearest.tolist(), strict=True)
+    assert dict(found) == wanted
+    assert len(cells) == len(wanted)

@@ -114,15 +114,45 @@ def _headed(
 
 def _around(poses: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """(N, 2) positions of the grid around poses, in order, and (N,) the pose nearest to each."""
-    steps = np.arange(-math.ceil(_AROUND / _STEP), math.ceil(_AROUND / _STEP) + 1)
-    disc = np.stack(np.meshgrid(steps, steps, indexing="ij"), axis=-1).reshape(-1, 2)
-    at = poses[:, np.newaxis, :2] / _STEP
-    cells = np.floor(at).astype(np.int64) + disc
-    far = np.hypot(*np.moveaxis(cells - at, -1, 0)).ravel()
-    order = np.argsort(far, kind="stable")
-    order = order[: np.searchsorted(far[order], _AROUND / _STEP)]
-    found, first = np.unique(cells.reshape(-1, 2)[order], axis=0, return_index=True)
-    return found * _STEP, order[first] // len(disc)
+    cells, nearest = _cells_around(poses / _STEP, _AROUND / _STEP)
+    order = np.lexsort(cells.T)
+    return cells[order] * _STEP, nearest[order]
+
+
+@kernel
+def _cells_around(poses, reach):  # type: ignore[no-untyped-def]
+    """Cells no farther from poses than ``reach``, all in cells, and the pose nearest to each."""
+    wide = int(math.ceil(reach))
+    slots = 64
+    while slots < 2 * len(poses) * (2 * wide + 2) ** 2:
+        slots *= 2
+    cells = np.empty((slots, 2), np.int64)
+    nearest = np.full(slots, -1)
+    far = np.empty(slots)
+    found = 0
+    for n in range(len(poses)):
+        x, y = poses[n, 0], poses[n, 1]
+        for v in range(int(math.floor(y)) - wide, int(math.floor(y)) + wide + 2):
+            for u in range(int(math.floor(x)) - wide, int(math.floor(x)) + wide + 2):
+                away = (u - x) * (u - x) + (v - y) * (v - y)
+                if away > reach * reach:
+                    continue
+                slot = (u * 73856093 ^ v * 19349663) & (slots - 1)
+                while nearest[slot] >= 0 and (cells[slot, 0] != u or cells[slot, 1] != v):
+                    slot = (slot + 1) & (slots - 1)
+                if nearest[slot] < 0 or away < far[slot]:
+                    found += nearest[slot] < 0
+                    cells[slot, 0], cells[slot, 1] = u, v
+                    nearest[slot], far[slot] = n, away
+    kept = np.empty((found, 2), np.int64)
+    pose = np.empty(found, np.int64)
+    found = 0
+    for slot in range(slots):
+        if nearest[slot] >= 0:
+            kept[found, 0], kept[found, 1] = cells[slot, 0], cells[slot, 1]
+            pose[found] = nearest[slot]
+            found += 1
+    return kept, pose
 
 
 @kernel
