@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from ._jit import kernel
 from .graph import AnchorGraph
+from .ranking import first_from
 
 __all__ = ["EdgesByLength", "LengthRelation", "corresponding_lengths"]
 
@@ -188,14 +189,7 @@ def _first(lengths, starts, length):  # type: ignore[no-untyped-def]
     if length <= 0.0:
         return np.int64(0)
     k = np.int64(min(length / _BIN_WIDTH, _BINS - 1.0))
-    low, high = starts[k], starts[k + 1]
-    while low < high:
-        middle = (low + high) // 2
-        if lengths[middle] < length:
-            low = middle + 1
-        else:
-            high = middle
-    return low
+    return first_from(lengths, starts[k], starts[k + 1], length)
 
 
 @kernel

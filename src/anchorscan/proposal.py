@@ -33,6 +33,7 @@ from ._jit import kernel
 from .anchors import AnchorKind, AnchorPoints, AnchorStack, stack_anchors
 from .field import Tiles, coarse_score
 from .pose import Pose2D
+from .ranking import first_from
 
 __all__ = [
     "Landmarks",
@@ -389,18 +390,6 @@ def spread(points, most):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _lower(lengths, low, high, length):  # type: ignore[no-untyped-def]
-    """First index in [low, high) whose length is not smaller."""
-    while low < high:
-        middle = (low + high) // 2
-        if lengths[middle] < length:
-            low = middle + 1
-        else:
-            high = middle
-    return low
-
-
-@kernel
 def _to_units(angle):  # type: ignore[no-untyped-def]
     """An angle in 65,536ths of a turn, not wrapped."""
     return np.int64(math.floor(angle * (_TURN / (2.0 * math.pi)) + 0.5))
@@ -529,7 +518,7 @@ def _corresponding(edge, middle, group, block, known, limits, out, found):  # ty
     tolerance, turn_tolerance, heading_tolerance = limits[2], limits[3], limits[4]
     begin, end = known.edge_starts[block, group], known.edge_starts[block, group + 1]
     # Unsigned indices spare the check for negative ones.
-    e = np.uint64(_lower(known.lengths, begin, end, length - tolerance))
+    e = np.uint64(first_from(known.lengths, begin, end, length - tolerance))
     end = np.uint64(end)
     symmetric = group % (_KINDS + 1) == 0
     while e < end and known.lengths[e] <= length + tolerance:

@@ -1,7 +1,7 @@
-"""The best of a few values, in order.
+"""The best of a few values, in order, and the place of one value among many in order.
 
-Inserted one by one: for the few that a query orders that takes no longer than to sort them, and to
-compile numba's own sorting takes seconds.
+The best are inserted one by one: for the few that a query orders that takes no longer than to
+sort them, and to compile numba's own sorting takes seconds.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import numpy as np
 
 from ._jit import kernel
 
-__all__ = ["best_first"]
+__all__ = ["best_first", "first_from"]
 
 
 @kernel
@@ -29,3 +29,15 @@ def best_first(values, most):  # type: ignore[no-untyped-def]
             k -= 1
         best[k] = i
     return best
+
+
+@kernel
+def first_from(values, low, high, least):  # type: ignore[no-untyped-def]
+    """First index from ``low`` up to ``high`` whose ascending value is not below ``least``."""
+    while low < high:
+        middle = (low + high) // 2
+        if values[middle] < least:
+            low = middle + 1
+        else:
+            high = middle
+    return low
