@@ -25,7 +25,7 @@ ORDER = (
     *("regression", "protocol", "journey"),
     *("array_file", "_jit", "ranking", "covariance"),
     *("angle_function", "segments", "anchors", "graph"),
-    *("length_relation", "oriented_relation", "database", "panorama", "alignment"),
+    *("length_relation", "oriented_relation", "database", "panorama", "spacing", "alignment"),
     *(
         "evidence",
         "field",

@@ -60,11 +60,18 @@ __all__ = [
     "VirtualEdges",
     "anchor_points",
     "angle_anchors",
+    "in_other_frame",
     "jump_edge_anchors",
     "stack_anchors",
     "virtual_edges",
 ]
 
+# Main angles of one scan are at least so far apart, radians.
+_MAINS_APART = math.radians(15.0)
+# A main angle that might as well be the first one is at least so far from it, and at least such a
+# share of it: a room that is not quite a rectangle is seen in one frame from here, in another
+# from there.
+_OTHER_APART, _OTHER_SHARE = math.radians(7.0), 0.5
 # Walls farther than this, metres, are no part of the place.
 _FARTHEST_WALL = 500.0
 
@@ -284,13 +291,48 @@ def virtual_edges(angles: AngleFunction, settings: AnchorSettings) -> list[Virtu
     return found
 
 
+def in_other_frame(
+    angles: AngleFunction, anchors: AnchorPoints, settings: AnchorSettings
+) -> AnchorPoints | None:
+    """Give the anchor points for a second main angle that is about as strong as the first.
+
+    Args:
+        angles: Of the scan.
+        anchors: Of the scan.
+        settings: Of the anchor points.
+
+    Returns:
+        The jump edges and angles as they are, and virtual edges of the second main angle; None
+        where there is no such angle.
+    """
+    limits = (settings.angle_function.bins, 2, _OTHER_SHARE, _OTHER_APART)
+    mains = _main_angles(angles.surface, angles.extents, limits)
+    if len(mains) < 2:
+        return None
+    main, walls = float(mains[1]), anchor_limits(settings)[3]
+    _, _, x, y = _virtual_edges(angles.points, angles.surface, angles.extents, main, walls)
+    positions, kinds, directions = _columns(_crossings(main, x, y))
+    kept = anchors.kinds != AnchorKind.VIRTUAL_EDGE
+    return AnchorPoints(
+        np.concatenate([anchors.positions[kept], positions]),
+        np.concatenate([anchors.kinds[kept], kinds]),
+        np.concatenate([anchors.directions[kept], directions]),
+        main,
+    )
+
+
 def anchor_limits(settings: AnchorSettings) -> tuple[tuple[Any, ...], ...]:
     """Return the settings that kernels need: of jump edges, angles, main angles and walls."""
     arm = (settings.arm, settings.shortest_arm, settings.flatness)
     return (
         (*arm, settings.smallest_rim_angle),
         (*arm, settings.smallest_turn, settings.farthest_corner),
-        (settings.angle_function.bins, settings.most_main_angles, settings.smallest_main_share),
+        (
+            settings.angle_function.bins,
+            settings.most_main_angles,
+            settings.smallest_main_share,
+            _MAINS_APART,
+        ),
         (
             settings.histogram_bin,
             settings.smallest_wall,
@@ -447,7 +489,7 @@ def _angle_anchors(points, way, moments, surfaces, limits):  # type: ignore[no-u
 @kernel
 def _main_angles(surface, weights, limits):  # type: ignore[no-untyped-def]
     """Main angles modulo 90 degrees, strongest first, each the mean direction at its peak."""
-    bins, most, share = limits
+    bins, most, share, apart = limits
     half = bins // 2
     raw = np.zeros(half)
     quarter = 0.5 * math.pi
@@ -480,8 +522,7 @@ def _main_angles(surface, weights, limits):  # type: ignore[no-untyped-def]
                     s += weights[i] * off
         angles[found] = centre + (s / c if c > 0.0 else 0.0)
         found += 1
-        # A second main angle lies at least 15 degrees from the first.
-        reach = int(math.ceil(math.radians(15.0) / quarter * half))
+        reach = int(math.ceil(apart / quarter * half))
         for j in range(-reach, reach + 1):
             smooth[(peak + j) % half] = 0.0
     return angles[:found]

@@ -49,7 +49,12 @@ _FEW = 128
 _BINS = 4096
 _BINS_OF_ONE = 2048.0
 
-Number = TypeVar("Number", np.int32, np.int64)
+# Of a scan, as ``spacing`` gives them.
+_WORDS = 3
+# Logarithm of the quality and likeness of the spacings choose together.
+_PER_VOTE, _LEAST_QUALITY = 0.3, 1e-6
+
+Number = TypeVar("Number", np.int32, np.int64, np.uint64)
 
 
 class DatabaseSettings(BaseModel):
@@ -69,6 +74,11 @@ class DatabaseSettings(BaseModel):
     )
     candidates: int | None = Field(
         None, ge=1, description="references that are followed further; null for all"
+    )
+    shortlisted: int = Field(
+        8000,
+        ge=0,
+        description="references of the most votes that the spacings of walls choose these from",
     )
     compared: int = Field(
         750,
@@ -103,6 +113,7 @@ class _State:
         parts: Edges of the references, large parts first.
         identifiers: (capacity,) of the reference in every slot.
         sizes: (capacity,) edges of the reference in every slot; -1 for a removed one.
+        spacings: (capacity, 3) which spacings of walls it saw.
         used: Slots in use.
         alive: References that are not removed.
     """
@@ -110,6 +121,7 @@ class _State:
     parts: tuple[Any, ...]
     identifiers: NDArray[np.int64]
     sizes: NDArray[np.int32]
+    spacings: NDArray[np.uint64]
     used: int
     alive: int
 
@@ -120,12 +132,21 @@ class RelationshipDatabase:
     Args:
         settings: Of the preselection.
         graphs: Identifier and graph of the references to begin with.
+        spacings: (3,) uint64 of each of them (``spacing``), taken after all graphs; none at all
+            where nobody will ask for them.
+
+    Raises:
+        ValueError: Two references have the same identifier, or there are not as many spacings.
     """
 
     def __init__(
-        self, settings: DatabaseSettings, graphs: Iterable[tuple[int, AnchorGraph]] = ()
+        self,
+        settings: DatabaseSettings,
+        graphs: Iterable[tuple[int, AnchorGraph]] = (),
+        spacings: Iterable[NDArray[np.uint64]] = (),
     ) -> None:
         self._writing = threading.Lock()
+        self._shortlisted = settings.shortlisted
         self._relation: LengthRelation | OrientedRelation
         if settings.relation == "length":
             self._relation = LengthRelation(settings.length_tolerance, settings.count_once)
@@ -141,7 +162,10 @@ class RelationshipDatabase:
                 yield graph
 
         edges, sizes = self._relation.edges(in_slots(), 0)
-        self._state = self._beginning(edges, sizes, np.array(identifiers, np.int64))
+        saw = np.array(list(spacings), np.uint64).reshape(-1, _WORDS)
+        if not len(saw):
+            saw = np.zeros((len(sizes), _WORDS), np.uint64)
+        self._state = self._beginning(edges, sizes, np.array(identifiers, np.int64), saw)
 
     @classmethod
     def from_arrays(
@@ -157,21 +181,25 @@ class RelationshipDatabase:
             ValueError: The arrays do not fit together, or are those of another relation.
         """
         identifiers, sizes = arrays.get("identifiers"), arrays.get("sizes")
-        if identifiers is None or sizes is None:
+        saw = arrays.get("spacings")
+        if identifiers is None or sizes is None or saw is None:
             raise ValueError("arrays of references are missing")
         if identifiers.dtype != np.int64 or sizes.dtype != np.int32 or identifiers.ndim != 1:
+            raise ValueError("arrays of references are of another kind")
+        if saw.dtype != np.uint64 or saw.shape != (len(identifiers), _WORDS):
             raise ValueError("arrays of references are of another kind")
         if identifiers.shape != sizes.shape or (len(sizes) and sizes.min() < 0):
             raise ValueError("arrays of references do not fit together")
         made = cls(settings)
         edges = made._relation.part(arrays, len(identifiers))
-        made._state = made._beginning(edges, np.array(sizes), np.array(identifiers))
+        made._state = made._beginning(edges, np.array(sizes), np.array(identifiers), saw)
         return made
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Return all that the database holds, as plain arrays by name.
 
-        ``identifiers`` (N,) int64 and ``sizes`` (N,) int32 of the references, and the edges:
+        ``identifiers`` (N,) int64, ``sizes`` (N,) int32 and ``spacings`` (N, 3) uint64 of the
+        references, and the edges:
         ``keys`` (K,), ``starts`` (K + 1,) and ``postings`` (E,), all uint32, or, by length,
         ``lengths`` (E,) float32 and ``slots`` (E,) int32.
         """
@@ -180,7 +208,11 @@ class RelationshipDatabase:
                 self._forget_removed(one_part=True)
             state = self._state
         used = state.used
-        references = {"identifiers": state.identifiers[:used], "sizes": state.sizes[:used].copy()}
+        references = {
+            "identifiers": state.identifiers[:used],
+            "sizes": state.sizes[:used].copy(),
+            "spacings": state.spacings[:used],
+        }
         return {**references, **state.parts[0].arrays()}
 
     def __len__(self) -> int:
@@ -189,8 +221,15 @@ class RelationshipDatabase:
     def __contains__(self, identifier: int) -> bool:
         return identifier in self._slots
 
-    def add(self, identifier: int, graph: AnchorGraph) -> None:
+    def add(
+        self, identifier: int, graph: AnchorGraph, spacings: NDArray[np.uint64] | None = None
+    ) -> None:
         """Add a reference while others search.
+
+        Args:
+            identifier: Of the reference.
+            graph: Of the reference.
+            spacings: (3,) of the walls that it saw.
 
         Raises:
             ValueError: The identifier is in use.
@@ -203,10 +242,12 @@ class RelationshipDatabase:
             edges, size = self._relation.edges([graph], slot)
             identifiers = _with_room(state.identifiers, slot)
             sizes = _with_room(state.sizes, slot)
+            saw = _with_room(state.spacings, slot)
             identifiers[slot], sizes[slot] = identifier, size[0]
+            saw[slot] = 0 if spacings is None else spacings
             self._slots[identifier] = slot
             parts = _tidied([*state.parts, edges])
-            self._state = _State(parts, identifiers, sizes, slot + 1, state.alive + 1)
+            self._state = _State(parts, identifiers, sizes, saw, slot + 1, state.alive + 1)
 
     def remove(self, identifier: int) -> None:
         """Remove a reference while others search.
@@ -224,21 +265,33 @@ class RelationshipDatabase:
             if 2 * self._removed > edges or edges <= _SMALLEST_PART:
                 self._forget_removed()
 
-    def votes(self, graph: AnchorGraph, most: int | None = None) -> Votes:
+    def votes(
+        self,
+        graph: AnchorGraph,
+        most: int | None = None,
+        spacings: NDArray[np.uint64] | None = None,
+    ) -> Votes:
         """Count corresponding edges and compute the quality measure (section 4.1).
 
         Args:
             graph: Of the scan that is looked for.
             most: How many references to return; None for all.
+            spacings: (3,) of the walls that it saw (``spacing``): they choose the references
+                from the first ``shortlisted`` by quality.
         """
         state = self._state
         slots, counts = self._relation.met(graph, state.parts, state.used, state.alive)
         edges = (self._relation.size(graph), self._fewest)
         if most is not None and most < len(slots):
-            chosen: slice | NDArray[np.int64] = slice(None)
+            some, of_some = slots, counts
             if len(slots) > _FEW:
-                chosen = _promising(slots, counts, state.sizes, edges, most)
-            found = _in_order(slots[chosen], counts[chosen], state, edges, most)
+                first = most if spacings is None else max(most, self._shortlisted)
+                chosen = _promising(slots, counts, state.sizes, edges, first)
+                some, of_some = slots[chosen], counts[chosen]
+            if spacings is not None and most < len(some):
+                chosen = _alike(some, of_some, state, edges, spacings, most)
+                some, of_some = some[chosen], of_some[chosen]
+            found = _in_order(some, of_some, state, edges, most)
             if len(found[0]) == most:
                 return Votes(*found)
         everywhere = np.zeros(state.used, np.float32)
@@ -246,14 +299,20 @@ class RelationshipDatabase:
         return Votes(*_in_order(np.arange(state.used), everywhere, state, edges, most))
 
     def _beginning(
-        self, edges: Any, sizes: NDArray[np.int32], identifiers: NDArray[np.int64]
+        self,
+        edges: Any,
+        sizes: NDArray[np.int32],
+        identifiers: NDArray[np.int64],
+        spacings: NDArray[np.uint64],
     ) -> _State:
         """Hold the edges of references in slots from zero on, and nothing else."""
         self._slots = {identifier: slot for slot, identifier in enumerate(identifiers.tolist())}
         if len(self._slots) != len(identifiers):
             raise ValueError("two references have the same identifier")
+        if len(spacings) != len(identifiers):
+            raise ValueError(f"{len(identifiers)} references have {len(spacings)} spacings")
         self._removed = 0
-        return _State((edges,), identifiers, sizes, len(sizes), len(sizes))
+        return _State((edges,), identifiers, sizes, spacings, len(sizes), len(sizes))
 
     def _forget_removed(self, *, one_part: bool = False) -> None:
         """Leave out what was removed and count the slots anew."""
@@ -262,9 +321,11 @@ class RelationshipDatabase:
         numbers = np.where(alive, np.cumsum(alive, dtype=np.int32) - np.int32(1), np.int32(-1))
         parts = _tidied([part.renumbered(numbers) for part in state.parts], one_part)
         identifiers, sizes = state.identifiers[:used][alive], state.sizes[:used][alive]
+        spacings = state.spacings[:used][alive]
         self._slots = {identifier: slot for slot, identifier in enumerate(identifiers.tolist())}
         self._removed = 0
-        self._state = _State(parts, identifiers, sizes, len(identifiers), len(identifiers))
+        count = len(identifiers)
+        self._state = _State(parts, identifiers, sizes, spacings, count, count)
 
 
 def quality(graph: AnchorGraph, other: AnchorGraph, settings: DatabaseSettings) -> float:
@@ -320,11 +381,69 @@ def _qualities(slots, counts, identifiers, sizes, edges):  # type: ignore[no-unt
     return alive[:used], found[:used], quality[:used]
 
 
+def _alike(
+    slots: NDArray[np.int32],
+    counts: NDArray[np.float32],
+    state: _State,
+    edges: tuple[int, int],
+    spacings: NDArray[np.uint64],
+    most: int,
+) -> NDArray[np.int64]:
+    """Places of the ``most`` slots that are best by quality and spacings; equals by identifier."""
+    known = (state.sizes, state.spacings)
+    scores: NDArray[np.float64] = _scores(slots, counts, known, edges, spacings)
+    least = np.partition(scores, len(scores) - most)[len(scores) - most]
+    chosen = np.flatnonzero(scores >= least)
+    if len(chosen) > most:
+        order = np.lexsort((state.identifiers[slots[chosen]], -scores[chosen]))
+        chosen = chosen[order[:most]]
+    return chosen
+
+
+@kernel
+def _bits(word):  # type: ignore[no-untyped-def]
+    """How many bits of a word are set."""
+    word -= (word >> np.uint64(1)) & np.uint64(0x5555555555555555)
+    pairs = np.uint64(0x3333333333333333)
+    word = (word & pairs) + ((word >> np.uint64(2)) & pairs)
+    word = (word + (word >> np.uint64(4))) & np.uint64(0x0F0F0F0F0F0F0F0F)
+    return (word * np.uint64(0x0101010101010101)) >> np.uint64(56)
+
+
+@kernel
+def _scores(slots, counts, known, edges, spacings):  # type: ignore[no-untyped-def]
+    """What slots promise by quality and by spacings that are those of the scan.
+
+    The likeness is the cosine between the bits, the larger one of both ways that the directions
+    of the main walls may correspond.
+    """
+    sizes, saw = known
+    half = np.uint64(32)
+    x, y, back = spacings[0], spacings[1], spacings[2]
+    kcab = (back >> half) | (back << half)
+    own = _bits(x) + _bits(y) + _bits(back)
+    scores = np.empty(len(slots))
+    for k in range(len(slots)):
+        size = sizes[slots[k]]
+        if size < 0:
+            scores[k] = -np.inf
+            continue
+        pairs = np.float64(edges[0]) * max(size, edges[1], 1)
+        quality = np.float64(counts[k]) ** 2 / max(pairs, 1.0)
+        of_x, of_y, of_back = saw[slots[k], 0], saw[slots[k], 1], saw[slots[k], 2]
+        straight = _bits(of_x & x) + _bits(of_y & y) + _bits(of_back & back)
+        across = _bits(of_x & y) + _bits(of_y & x) + _bits(of_back & kcab)
+        both = np.float64(own) * np.float64(_bits(of_x) + _bits(of_y) + _bits(of_back))
+        alike = np.float64(max(straight, across)) / math.sqrt(both) if both > 0.0 else 0.0
+        scores[k] = _PER_VOTE * math.log(quality + _LEAST_QUALITY) + alike
+    return scores
+
+
 def _with_room(values: NDArray[Number], slot: int) -> NDArray[Number]:
     """Return the array, or a longer copy when it has no place for one more."""
     if slot < len(values):
         return values
-    longer = np.zeros(max(2 * len(values), 64), values.dtype)
+    longer = np.zeros((max(2 * len(values), 64), *values.shape[1:]), values.dtype)
     longer[: len(values)] = values
     return longer
 

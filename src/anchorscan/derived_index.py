@@ -56,7 +56,7 @@ _FORMAT = 1
 # the version.
 _STAGES = (
     *("__init__", "scan", "angle_function", "segments", "anchors", "graph"),
-    *("length_relation", "oriented_relation", "database", "panorama"),
+    *("length_relation", "oriented_relation", "database", "panorama", "spacing"),
     *("evidence", "field", "proposal", "placed"),
 )
 _SECTIONS = ("method", "anchors", "graph", "database", "field")

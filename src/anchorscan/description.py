@@ -5,6 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 
+import numpy as np
+from numpy.typing import NDArray
+
 from ._jit import kernel
 from .anchors import (
     AnchorPoints,
@@ -12,16 +15,19 @@ from .anchors import (
     VirtualEdges,
     all_anchors,
     anchor_limits,
+    in_other_frame,
     virtual_edges,
 )
 from .angle_function import AngleFunction, _angle_function, surface_limits, sweep
 from .evaluation import Outline, _outline
-from .graph import AnchorGraph, _edges, edge_limits
+from .graph import AnchorGraph, _edges, anchor_graph, edge_limits
+from .panorama import View, panorama, view
 from .scan import LaserScan
 from .segments import Segments, _segments, segment_limits
 from .settings import Settings
+from .spacing import spacings
 
-__all__ = ["Description", "describe"]
+__all__ = ["Description", "Look", "describe", "looks"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,6 +54,41 @@ class Description:
     def edges(self) -> tuple[VirtualEdges, ...]:
         """Walls behind the virtual edges, per main angle (section 3), for whoever looks at them."""
         return tuple(virtual_edges(self.angles, self.settings))
+
+
+@dataclass(frozen=True, eq=False)
+class Look:
+    """What a scan is looked for by, in one frame of main walls.
+
+    Args:
+        graph: Its anchor points and their relations.
+        view: What it is compared by.
+        spacings: (3,) uint64 of the walls that it saw.
+    """
+
+    graph: AnchorGraph
+    view: View
+    spacings: NDArray[np.uint64]
+
+
+def looks(description: Description, settings: Settings) -> tuple[Look, ...]:
+    """Say what a scan is looked for by: one look, or two where two main angles are about as strong.
+
+    Args:
+        description: Of the scan.
+        settings: Of all stages.
+    """
+    angles, graph = description.angles, description.graph
+    graphs = [graph]
+    other = in_other_frame(angles, description.anchors, settings.anchors)
+    if other is not None:
+        graphs.append(anchor_graph(other, settings.graph))
+    return tuple(_look(angles.points, graph) for graph in graphs)
+
+
+def _look(points: NDArray[np.float64], graph: AnchorGraph) -> Look:
+    saw = spacings(panorama(points, graph.anchors.main_angle)[None])[0]
+    return Look(graph, view(points, graph.anchors), saw)
 
 
 def describe(scan: LaserScan, settings: Settings) -> Description:

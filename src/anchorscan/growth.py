@@ -38,11 +38,11 @@ from numpy.typing import NDArray
 from .anchors import AnchorPoints, AnchorStack, stack_anchors
 from .array_file import read_arrays, write_arrays
 from .database import RelationshipDatabase, Votes
-from .description import Description, describe
+from .description import Description, Look, describe, looks
 from .errors import AnchorscanError, MissingExtraError
 from .field import LikelihoodField
 from .graph import AnchorGraph
-from .panorama import DIRECTIONS, panorama, reordered, view, worth
+from .panorama import DIRECTIONS, panorama, reordered, worth
 from .pose import Pose2D
 from .proposal import joined, landmarks, proposals
 from .protocol import is_correct, thin
@@ -50,6 +50,7 @@ from .reference import Reference
 from .scan import LaserScan
 from .settings import Settings
 from .simulator import SensorModel, random_building, random_poses, simulate
+from .spacing import spacings
 from .verification import on_large, readings, verify
 
 __all__ = ["RANKS", "SIZES", "Growth", "Place", "Scene", "Size", "distractors", "measure", "slope"]
@@ -302,7 +303,7 @@ class _Asked:
 
     def __init__(self, place: Place, settings: Settings, chosen: Sequence[int]) -> None:
         self.place = place
-        self.compared = settings.database.compared
+        self.settings = settings
         self.known = [describe(each.scan, settings) for each in place.references]
         self.poses = np.array([_pose(each).to_array() for each in place.references])
         self.queries = [place.queries[k] for k in chosen]
@@ -319,7 +320,6 @@ class _Asked:
             landmarks([(known.anchors, _pose(each))], settings.proposal)
             for known, each in zip(self.known, place.references, strict=True)
         ]
-        self._settings = settings
 
     def right(self, pose: Pose2D) -> NDArray[np.bool_]:
         """Say of every reference whether it lies within the limits of a pose."""
@@ -332,7 +332,7 @@ class _Asked:
         """Say whether the search ends at the truth when only some references propose."""
         if not some:
             return False
-        settings = self._settings
+        settings = self.settings
         seen = readings(description.angles, settings.verification)
         large = on_large(seen)
         related = joined([self._landmarks[number] for number in some])
@@ -443,6 +443,7 @@ def _measured(
     database = RelationshipDatabase(
         settings.database,
         ((_FIRST_DISTRACTOR + n, _graph(a)) for n, a in made.all(distractors(pool, count, seed))),
+        made.spacings(),
     )
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "relations"
@@ -503,6 +504,10 @@ class _Made:
             )
             yield number, anchors
 
+    def spacings(self) -> Iterator[NDArray[np.uint64]]:
+        """Those of walls, once all are made."""
+        yield from spacings(self._panoramas)
+
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Plain arrays by name."""
         positions, kinds, directions = (
@@ -544,10 +549,15 @@ class _Search:
 
     def votes(self, description: Description) -> Votes:
         """The best candidates for a scan, best first."""
-        most, compared = RANKS[-1] + _PASSED_OVER, self._asked.compared
-        votes = self._database.votes(description.graph, max(most, compared))
+        most = RANKS[-1] + _PASSED_OVER
+        seen = looks(description, self._asked.settings)
+        return reordered([self._compared(look, most) for look in seen], most)
+
+    def _compared(self, look: Look, most: int) -> tuple[Votes, NDArray[np.float64]]:
+        """Votes, and what the first of these are worth."""
+        compared = self._asked.settings.database.compared
+        votes = self._database.votes(look.graph, max(most, compared), look.spacings)
         first, quality = votes.references[:compared], votes.quality[:compared]
-        seen = view(description.angles.points, description.anchors)
         worths = np.empty(len(first))
         of_crowd = first >= _FIRST_DISTRACTOR
         for known, those, begin in (
@@ -555,8 +565,8 @@ class _Search:
             (self._asked.seen, ~of_crowd, 0),
         ):
             asked = (first[those] - begin, quality[those], most)
-            worths[those] = worth(seen, known.anchors, known.panoramas, *asked)
-        return reordered(votes, worths, most)
+            worths[those] = worth(look.view, known.anchors, known.panoramas, *asked)
+        return votes, worths
 
 
 class _Round:
@@ -570,8 +580,9 @@ class _Round:
         buildings: Sequence[str],
     ) -> None:
         start = time.thread_time()
+        saw = spacings(asked.seen.panoramas)
         for number, known in enumerate(asked.known):
-            database.add(number, known.graph)
+            database.add(number, known.graph, saw[number])
         self.adding = (time.thread_time() - start) * 1e3 / len(asked.known)
         own = np.array([building == asked.place.building for building in buildings])
         search = _Search(database, crowd, asked)

@@ -23,6 +23,7 @@ The order is that of
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -157,17 +158,25 @@ def worth(
     return found
 
 
-def reordered(votes: Votes, worths: NDArray[np.float64], most: int) -> Votes:
+def reordered(found: Sequence[tuple[Votes, NDArray[np.float64]]], most: int) -> Votes:
     """Put the first votes in the order of their worth, and keep as many as are wanted.
 
     Args:
-        votes: Of the references.
-        worths: (K,) of the first of them.
+        found: Votes of the references and what (K,) the first of them are worth, for each look
+            at the scan; a reference counts by the look that it is worth most in.
         most: How many are wanted.
     """
-    order = np.argsort(-worths, kind="stable")
-    order = np.concatenate([order, np.arange(len(order), len(votes))])[:most]
-    return Votes(votes.references[order], votes.counts[order], votes.quality[order])
+    worths = [np.append(worth, np.full(len(votes) - len(worth), -np.inf)) for votes, worth in found]
+    references, counts, quality = (
+        np.concatenate([getattr(votes, name) for votes, _ in found])
+        for name in ("references", "counts", "quality")
+    )
+    order = np.lexsort((references, -quality, -np.concatenate(worths)))
+    if len(found) > 1:
+        _, first = np.unique(references[order], return_index=True)
+        order = order[np.sort(first)]
+    order = order[:most]
+    return Votes(references[order], counts[order], quality[order])
 
 
 @kernel

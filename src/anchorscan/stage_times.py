@@ -27,6 +27,7 @@ STAGES: Mapping[str, str] = {
     "description": "extraction",
     "database": "search",
     "panorama": "search",
+    "spacing": "search",
     "proposal": "search",
     "alignment": "alignment",
     "evaluation": "evaluation",

@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property, reduce
+from itertools import chain
 from queue import SimpleQueue
 from typing import Any, TypeVar
 
@@ -21,13 +22,13 @@ from numpy.typing import NDArray
 from .anchors import AnchorStack, stack_anchors
 from .database import RelationshipDatabase, Votes, quality
 from .decision import Decision, covariance, decide
-from .description import Description, describe
+from .description import Description, Look, describe, looks
 from .evaluation import evaluate_outlines
 from .field import FieldArrays, LikelihoodField, Tiles
 from .graph import anchor_graph
 from .hypothesis import Hypothesis
 from .pairwise import Known
-from .panorama import reordered, view, worth
+from .panorama import reordered, worth
 from .placed import Lot, lot_of, nearest, tidied
 from .pose import Pose2D
 from .proposal import (
@@ -42,6 +43,7 @@ from .proposal import (
 from .reference import Reference
 from .scan import LaserScan
 from .settings import Settings
+from .spacing import spacings
 from .standing import Places, places, standing
 from .verification import Fits, follow, on_large, readings, settled, verify
 
@@ -246,7 +248,8 @@ class StitchedMap:
             lot = lot_of([known], self._next_serial, self._settings.proposal)
             self._field.add(*_placed(known.reference))  # first, since it may refuse
             if self._database is not None:
-                self._database.add(identifier, known.description.graph)
+                saw = spacings(lot.panoramas)[0]
+                self._database.add(identifier, known.description.graph, saw)
             self._memory[self._next_serial] = known
             self._next_serial += 1
             self._hold(tidied([*self._content.lots, lot]))
@@ -377,22 +380,31 @@ class StitchedMap:
                         for place, identifier in enumerate(lot.identifiers.tolist())
                         if lot.is_there[place]
                     ),
+                    chain.from_iterable(
+                        spacings(lot.panoramas[lot.is_there]) for lot in self._content.lots
+                    ),
                 )
             return self._database
 
     def _candidates(self, description: Description, most: int, content: _Content) -> Votes:
         """Choose by votes, and among the first of these by what they saw."""
+        seen = looks(description, self._settings)
+        return reordered([self._compared(look, most, content) for look in seen], most)
+
+    def _compared(
+        self, look: Look, most: int, content: _Content
+    ) -> tuple[Votes, NDArray[np.float64]]:
+        """Votes, and what the first of these are worth."""
         compared = self._settings.database.compared
-        votes = self._voting().votes(description.graph, max(most, compared))
+        votes = self._voting().votes(look.graph, max(most, compared), look.spacings)
         first = votes.references[:compared]
         worths = np.full(len(first), -np.inf)  # of those removed in between
-        seen = view(description.angles.points, description.anchors)
         for lot in content.lots:
             places = lot.find_all(first)
             at = np.flatnonzero(places >= 0)
             found = (places[at], votes.quality[at], most)
-            worths[at] = worth(seen, lot.anchors, lot.panoramas, *found)
-        return reordered(votes, worths, most)
+            worths[at] = worth(look.view, lot.anchors, lot.panoramas, *found)
+        return votes, worths
 
     def _some(self, identifiers: NDArray[np.int64], content: _Content) -> Landmarks:
         """Join the relations of single references, less any removed in between."""
