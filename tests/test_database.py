@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 
 import numpy as np
@@ -116,6 +117,61 @@ def test_the_order_of_the_references_does_not_matter(query, order):
     assert as_rows(straight) == as_rows(shuffled)
 
 
+def some_spacings(seed):
+    return np.random.default_rng(seed + 1).integers(0, 1 << 63, 3).astype(np.uint64)
+
+
+def plain_likeness(one, other):
+    """Cosine of bits, the larger of both ways that the axes may correspond."""
+    x, y, backs = (f"{int(word):064b}" for word in one)
+    turned = (int(y, 2), int(x, 2), int(backs[32:] + backs[:32], 2))
+    shared = max(
+        sum((int(a) & int(b)).bit_count() for a, b in zip(way, other, strict=True))
+        for way in (one, turned)
+    )
+    sizes = [sum(int(word).bit_count() for word in words) for words in (one, other)]
+    return shared / math.sqrt(sizes[0] * sizes[1]) if all(sizes) else 0.0
+
+
+@pytest.mark.parametrize("count", [60, 300])
+def test_spacings_choose_as_plain_comparing_does(count):
+    rng = np.random.default_rng(count)
+    graphs = [(k, graph_of(rng.uniform(0.0, 6.0, 12))) for k in rng.permutation(count).tolist()]
+    # Many are equal in everything: of these the lower identifiers are taken.
+    saw = {k: some_spacings(k % 7) if k % 5 else np.zeros(3, np.uint64) for k, _ in graphs}
+    graphs = [(k, graphs[k % 3][1]) for k, _ in graphs]
+    searched = RelationshipDatabase(by_length(), graphs, [saw[k] for k, _ in graphs])
+    query, own = graphs[0][1], some_spacings(3)
+    everything = searched.votes(query)
+    score = {
+        k: 0.3 * math.log(q + 1e-6) + plain_likeness(own, saw[k])
+        for k, q in zip(everything.references.tolist(), everything.quality.tolist(), strict=True)
+    }
+    for most in (1, 9, 50):
+        expected = sorted(score, key=lambda k: (-round(score[k], 9), k))[:most]
+        assert set(searched.votes(query, most, own).references.tolist()) == set(expected)
+
+
+def test_spacings_choose_only_from_those_of_the_most_votes():
+    rng = np.random.default_rng(4)
+    graphs = [(k, graph_of(rng.uniform(0.0, 6.0, 12))) for k in range(300)]
+    settings = by_length().model_copy(update={"shortlisted": 20})
+    searched = RelationshipDatabase(settings, graphs, map(some_spacings, range(300)))
+    query, own = graph_of(rng.uniform(0.0, 6.0, 12)), some_spacings(299)
+    first = searched.votes(query, 20)
+    chosen = searched.votes(query, 10, own)
+    # Those that are about as good as the last one may be among them.
+    assert chosen.quality.min() >= 0.98 * first.quality.min()
+    assert set(chosen.references.tolist()) - set(first.references[:10].tolist())
+    assert np.all(np.diff(chosen.quality) <= 0.0)
+
+
+def test_there_are_as_many_spacings_as_references():
+    graphs = [(k, graph_of([1.0])) for k in range(3)]
+    with pytest.raises(ValueError, match="3 references have 2 spacings"):
+        RelationshipDatabase(by_length(), graphs, map(some_spacings, range(2)))
+
+
 class ChangingDatabase(RuleBasedStateMachine):
     """Adding and removing in any order leaves what building at once would have made."""
 
@@ -135,7 +191,7 @@ class ChangingDatabase(RuleBasedStateMachine):
     @rule(seed=st.integers(0, 1 << 20))
     def add(self, seed):
         self.model[self.next] = self.graph(seed)
-        self.database.add(self.next, self.model[self.next])
+        self.database.add(self.next, self.model[self.next], some_spacings(self.next))
         self.next += 1
 
     @precondition(lambda self: self.model)
@@ -154,9 +210,12 @@ class ChangingDatabase(RuleBasedStateMachine):
 
     @invariant()
     def votes_as_built_at_once(self):
-        at_once = RelationshipDatabase(self.settings, self.model.items())
+        spacings = map(some_spacings, self.model)
+        at_once = RelationshipDatabase(self.settings, self.model.items(), spacings)
         assert as_rows(self.database.votes(self.query)) == as_rows(at_once.votes(self.query))
         assert as_rows(self.database.votes(self.query, 3)) == as_rows(at_once.votes(self.query, 3))
+        chosen = (self.query, 3, some_spacings(-1))
+        assert as_rows(self.database.votes(*chosen)) == as_rows(at_once.votes(*chosen))
         assert len(self.database) == len(self.model)
 
 
@@ -212,6 +271,9 @@ def oriented_graph(seed):
         ("sizes", lambda a: -a - 1),
         ("identifiers", np.zeros_like),
         ("identifiers", lambda a: None),
+        ("spacings", lambda a: a[:-1]),
+        ("spacings", lambda a: a.astype(np.int64)),
+        ("spacings", lambda a: None),
         ("slots", lambda a: a + np.int32(100)),
         ("slots", lambda a: a - np.int32(100)),
         ("lengths", lambda a: a[::-1].copy()),

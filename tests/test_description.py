@@ -14,7 +14,7 @@ from scans import scans, sweeps
 from anchorscan import LaserScan, Settings
 from anchorscan.anchors import AnchorKind, anchor_points, virtual_edges
 from anchorscan.angle_function import angle_function
-from anchorscan.description import describe
+from anchorscan.description import describe, looks
 from anchorscan.evaluation import outline
 from anchorscan.graph import anchor_graph
 from anchorscan.segments import segments
@@ -69,6 +69,45 @@ def test_virtual_edges_are_the_crossings_of_the_walls_that_are_told(scan, settin
     if whole.edges:
         assert whole.anchors.main_angle == whole.edges[0].main_angle
     assert len(whole.edges) <= settings.anchors.most_main_angles
+
+
+def room_between(normals, distances):
+    """Give a scan of a room between walls of these directions and distances."""
+    bearings = np.arange(360) * math.pi / 180.0
+    toward = np.cos(bearings[:, None] - np.radians(normals))
+    with np.errstate(divide="ignore"):
+        ranges = np.where(toward > 0.01, np.array(distances) / toward, np.inf).min(axis=1)
+    return LaserScan(ranges, 0.0, math.pi / 180.0, 0.05, 60.0)
+
+
+def test_a_room_that_is_no_rectangle_is_looked_for_in_both_frames():
+    settings = Settings.preset()
+    for normals, angles in (([0, 90, 180, 270], [0]), ([0, 70, 180, 250], [0, 70])):
+        whole = describe(room_between(normals, [3.0, 2.0, 3.0, 2.0]), settings)
+        seen = looks(whole, settings)
+        assert seen[0].graph is whole.graph
+        mains = sorted(round(math.degrees(look.graph.anchors.main_angle)) % 90 for look in seen)
+        assert mains == angles
+
+
+@given(scans())
+@examples(max_examples=30)
+def test_another_frame_has_other_virtual_edges_and_all_else_the_same(scan):
+    settings = Settings.preset()
+    whole = describe(scan, settings)
+    first, *others = looks(whole, settings)
+    same(first.graph, whole.graph)
+    assert len(others) <= 1
+    for other in others:
+        anchors = other.graph.anchors
+        off = math.remainder(anchors.main_angle - whole.anchors.main_angle, 0.5 * math.pi)
+        assert abs(off) > math.radians(1.0)  # each is the mean around peaks 7 degrees apart
+        for name in ("positions", "kinds", "directions"):
+            ours, theirs = (
+                getattr(each, name)[each.kinds != AnchorKind.VIRTUAL_EDGE]
+                for each in (whole.anchors, anchors)
+            )
+            np.testing.assert_array_equal(ours, theirs)
 
 
 def test_the_default_takes_more_anchors_than_the_paper(real_scans):

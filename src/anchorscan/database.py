@@ -48,6 +48,8 @@ _FEW = 128
 # quality, and how many of them make one.
 _BINS = 4096
 _BINS_OF_ONE = 2048.0
+# References have at most about so many edges; the quality of larger ones takes longer.
+_SIZES = 512
 
 # Of a scan, as ``spacing`` gives them.
 _WORDS = 3
@@ -76,12 +78,12 @@ class DatabaseSettings(BaseModel):
         None, ge=1, description="references that are followed further; null for all"
     )
     shortlisted: int = Field(
-        8000,
+        4000,
         ge=0,
         description="references of the most votes that the spacings of walls choose these from",
     )
     compared: int = Field(
-        750,
+        500,
         ge=0,
         description="references in a map that are compared by what they saw to choose these",
     )
@@ -455,6 +457,11 @@ def _promising(slots, counts, sizes, edges, most):  # type: ignore[no-untyped-de
     A histogram of the square roots tells which quality that many reach, so that nothing is
     sorted but the few that are left.
     """
+    # A root and a division for each size instead of each slot.
+    shares = np.empty(_SIZES)
+    for size in range(_SIZES):
+        pairs = np.float64(edges[0]) * max(size, edges[1], 1)
+        shares[size] = _BINS_OF_ONE / math.sqrt(pairs) if pairs > 0.0 else 0.0
     scale = np.empty(len(counts), np.int32)
     reached = np.zeros(_BINS, np.int64)
     for k in range(len(slots)):
@@ -462,8 +469,11 @@ def _promising(slots, counts, sizes, edges, most):  # type: ignore[no-untyped-de
         if size < 0 or edges[0] == 0:
             scale[k] = -1
             continue
-        root = counts[k] / math.sqrt(np.float64(edges[0]) * max(size, edges[1], 1))
-        scale[k] = min(int(root * _BINS_OF_ONE), _BINS - 1)
+        if size < _SIZES:
+            root = counts[k] * shares[size]
+        else:
+            root = counts[k] * _BINS_OF_ONE / math.sqrt(np.float64(edges[0]) * max(size, edges[1]))
+        scale[k] = min(int(root), _BINS - 1)
         reached[scale[k]] += 1
     least, enough = _BINS, 0
     while least > 0 and enough < most:

@@ -81,7 +81,7 @@ class OrientedSettings(BaseModel):
     longest_edge: float = Field(25.0, gt=0.0, le=30.0, description="edges that are used, metres")
     most_edges: int = Field(256, ge=1, description="edges that are kept of one reference")
     most_votes: int = Field(
-        500_000, ge=1, description="database edges looked at; the commonest keys go first"
+        300_000, ge=1, description="database edges looked at; the commonest keys go first"
     )
     most_opening: int = Field(
         75_000, ge=1, description="the rarest ones; others count for references that these met"

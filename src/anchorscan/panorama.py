@@ -15,7 +15,7 @@ it is hidden, and says nothing.
 
 The order is that of
 
-    worth = agreement + agreement the other way + 0.05 * pairs + 0.3 * log(q_m).
+    worth = agreement + agreement the other way + 0.05 * pairs + 0.2 * log(q_m).
 
 ``docs/scale.md`` has the measurements.
 """
@@ -52,6 +52,10 @@ _UNITS = np.column_stack([np.cos(_ANGLES), np.sin(_ANGLES)]).astype(np.float32)
 _READINGS = 40
 _FARTHEST_READING = 30.0
 _EVERY = 4
+# Readings side by side agree together.  Whoever asks far apart ones first knows sooner: steps of
+# the golden ratio, and every seventh of the directions in turn.
+_GOLDEN = 0.5 * (math.sqrt(5.0) - 1.0)
+_STRIDE = 7 * _EVERY
 # Pairs of anchor points: directions differ by no more, radians; the scan was taken no farther
 # from the reference; shifts that agree, metres; pairs of one quarter turn; shifts that are tried;
 # anchor points of one scan: more make some searches slow, and choose hardly better.
@@ -63,7 +67,9 @@ _TRIED = 2
 _MOST_ANCHORS = 20
 # A reading is where it is expected within so many metres and so much of its distance.
 _TOLERANCE, _TOLERANCE_SHARE = 0.07, 0.015
-_PER_PAIR, _PER_VOTE = 0.05, 0.3
+# Agreement is counted in whole readings; the bound is to err on the safe side.
+_SLACK = 1e-3
+_PER_PAIR, _PER_VOTE = 0.05, 0.2
 _LEAST_QUALITY = 1e-6
 _NO_AGREEMENT = -2.0
 _QUARTERS = ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))
@@ -114,6 +120,7 @@ def view(points: NDArray[np.float64], anchors: AnchorPoints) -> View:
     upright = np.array([[c, -s], [s, c]])
     near = points[np.hypot(points[:, 0], points[:, 1]) < _FARTHEST_READING]
     some = np.linspace(0, len(near) - 1, min(_READINGS, len(near))).astype(np.int64)
+    some = some[np.argsort(np.arange(len(some)) * _GOLDEN % 1.0)]
     return View(
         (anchors.positions[:_MOST_ANCHORS] @ upright).astype(np.float32),
         anchors.kinds[:_MOST_ANCHORS].astype(np.int64),
@@ -153,8 +160,7 @@ def worth(
         anchors.starts,
     )
     votes = _PER_VOTE * np.log(quality + _LEAST_QUALITY)
-    tables = (_DISTANCES, _UNITS)
-    found: NDArray[np.float64] = _worth(seen, stack, panoramas, places, votes, tables, most)
+    found: NDArray[np.float64] = _worth(seen, stack, panoramas, places, votes, most)
     return found
 
 
@@ -241,27 +247,44 @@ def _agrees(x, y, distances):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _there(readings, c, s, x, y, distances):  # type: ignore[no-untyped-def]
-    """Agreement of the scan's readings with the reference's panorama."""
-    total = 0
+def _there(readings, c, s, x, y, distances, needed):  # type: ignore[no-untyped-def]
+    """Agreement of the scan's readings with the reference's panorama.
+
+    Once less than ``needed`` is sure, it is left at what it would be if no other one agreed;
+    the second value says so.
+    """
+    count = max(len(readings), 1)
+    least = needed * count - _SLACK
+    total, left = 0, len(readings)
     for i in range(len(readings)):
         px, py = readings[i, 0], readings[i, 1]
         total += _agrees(c * px - s * py + x, s * px + c * py + y, distances)
-    return total / max(len(readings), 1)
+        left -= 1
+        if total + left < least:
+            return (total - left) / count, False
+    return total / count, True
 
 
 @kernel
-def _back(distances, c, s, x, y, units, own):  # type: ignore[no-untyped-def]
-    """Agreement of the reference's directions with the scan's panorama."""
-    total, count = 0, 0
+def _back(distances, c, s, x, y, own, needed):  # type: ignore[no-untyped-def]
+    """Agreement of the reference's directions with the scan's panorama, as in ``_there``."""
+    left = 0
     for at in range(0, DIRECTIONS, _EVERY):
+        left += distances[at] > 0.0
+    count = max(left, 1)
+    least = needed * count - _SLACK
+    total, at = 0, 0
+    for _ in range(DIRECTIONS // _EVERY):
+        at = (at + _STRIDE) % DIRECTIONS
         distance = distances[at]
         if distance <= 0.0:
             continue
-        px, py = distance * units[at, 0] - x, distance * units[at, 1] - y
+        px, py = distance * _UNITS[at, 0] - x, distance * _UNITS[at, 1] - y
         total += _agrees(c * px + s * py, c * py - s * px, own)
-        count += 1
-    return total / max(count, 1)
+        left -= 1
+        if total + left < least:
+            return (total - left) / count
+    return total / count
 
 
 @kernel
@@ -292,6 +315,8 @@ def _shifts(seen, positions, kinds, directions, pairs, tried):  # type: ignore[n
     found = 0
     for turn in range(4):
         for k in range(counts[turn]):
+            if found == _TRIED and tried[found - 1, 3] >= counts[turn]:
+                break
             found = _noted(pairs[turn], counts[turn], k, turn, tried, found)
     return found
 
@@ -352,9 +377,8 @@ def _upright(stack, place, positions, kinds, directions):  # type: ignore[no-unt
 
 
 @kernel
-def _worth(seen, stack, panoramas, places, votes, tables, most):  # type: ignore[no-untyped-def]
+def _worth(seen, stack, panoramas, places, votes, most):  # type: ignore[no-untyped-def]
     """What each reference is worth, or a lower bound where it is not among the best."""
-    table, units = tables
     found = np.empty(len(places))
     best = np.full(max(min(most, len(places)), 1), -np.inf)
     positions = np.empty((_MOST_ANCHORS, 2), np.float32)
@@ -367,7 +391,7 @@ def _worth(seen, stack, panoramas, places, votes, tables, most):  # type: ignore
         count = _upright(stack, places[k], positions, kinds, directions)
         shifts = _shifts(seen, positions[:count], kinds[:count], directions[:count], pairs, tried)
         for at in range(DIRECTIONS):
-            distances[at] = table[panoramas[places[k], at]]
+            distances[at] = _DISTANCES[panoramas[places[k], at]]
         found[k] = _NO_AGREEMENT + votes[k]
         for n in range(shifts):
             quarter = _QUARTERS[int(tried[n, 0])]
@@ -375,11 +399,14 @@ def _worth(seen, stack, panoramas, places, votes, tables, most):  # type: ignore
             x, y = tried[n, 1], tried[n, 2]
             sure = _PER_PAIR * tried[n, 3] + votes[k]
             # The other way adds one at most: the worst of the best may be out of reach already.
-            value = _there(seen.readings, c, s, x, y, distances) + sure
-            if value + 1.0 < best[-1]:
+            needed = best[-1] - sure
+            there, complete = _there(seen.readings, c, s, x, y, distances, needed - 1.0)
+            value = sure + there
+            if not complete:
                 found[k] = max(found[k], value - 1.0)
                 continue
-            found[k] = max(found[k], value + _back(distances, c, s, x, y, units, seen.distances))
+            needed -= there
+            found[k] = max(found[k], value + _back(distances, c, s, x, y, seen.distances, needed))
         if found[k] > best[-1]:
             n = len(best) - 1
             while n > 0 and best[n - 1] < found[k]:
