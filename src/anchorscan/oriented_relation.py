@@ -181,7 +181,7 @@ class _Scratch(NamedTuple):
     Args:
         tallies: (``_BLOCK``,) uint64, the four of every slot of a block side by side; clear
             between blocks.
-        slots: (N,) those that were met.
+        slots: (N,) those that were met, and room for one more, which is written to in vain.
         counts: (N,) n_m of those.
     """
 
@@ -305,7 +305,7 @@ class OrientedRelation:
         They are given back when they are clear again: an interrupted query leaves none behind.
         """
         scratch: _Scratch | None = self._scratch.__dict__.pop("all_clear", None)
-        if scratch is None or len(scratch.slots) < used:
+        if scratch is None or len(scratch.slots) <= used:
             room = max(2 * used, 64)
             scratch = _Scratch(
                 np.zeros(_BLOCK, np.uint64),
@@ -519,15 +519,18 @@ def _tallied(postings, some, opens, scratch, count):  # type: ignore[no-untyped-
         slot = posting >> np.uint32(_TURN_BITS)
         if slot >> np.uint32(_BLOCK_BITS) != block:
             return e, count
-        tally = scratch.tallies[slot & np.uint32(_BLOCK - 1)]
-        if tally == 0:
-            if not opens:
-                continue
-            scratch.slots[count] = slot
-            count += 1
+        at = slot & np.uint32(_BLOCK - 1)
+        tally = scratch.tallies[at]
         shift = np.uint64(((posting - turn) & np.uint32(_TURNS - 1)) * np.uint32(_TALLY_BITS))
         room = np.uint64(_FULL) - ((tally >> shift) & np.uint64(_FULL))
-        scratch.tallies[slot & np.uint32(_BLOCK - 1)] = tally + (min(weight, room) << shift)
+        added = min(weight, room) << shift
+        # Whether a slot was met before is anybody's guess: nothing branches by it.
+        if opens:
+            scratch.slots[count] = slot
+            count += tally == 0
+        else:
+            added = added if tally != 0 else np.uint64(0)
+        scratch.tallies[at] = tally + added
     return end, count
 
 
