@@ -14,6 +14,10 @@ The database consists of parts, each a few times smaller than the one before it 
 changed once made: a new reference is a part of its own, and the last parts are merged when
 they have become of a size.  Removing marks the reference and leaves its edges until the next
 large merge.  So a reader keeps what it has begun with, and writing costs little.
+
+Among very many references the votes leave thousands about as good.  So the database can also hold
+which spacings of walls each one saw (``spacing``): of the references with the most votes those
+are taken of which ``0.3 * log(q_m)`` and the likeness of the spacings together are largest.
 """
 
 from __future__ import annotations
