@@ -83,10 +83,10 @@ class ProposalSettings(BaseModel):
     lone_heading_tolerance: float = Field(
         math.radians(25.0), gt=0.0, description="lone anchor to main angles, radians"
     )
-    most_edges: int = Field(400, ge=1, description="edges of a scan that propose, the longest")
+    most_edges: int = Field(800, ge=1, description="edges of a scan that propose, the longest")
     enough: int = Field(300, ge=0, description="with so many from edges no lone anchors")
     readings: int = Field(12, ge=4, description="readings of the first check")
-    most: int = Field(250, ge=1, description="proposals that pass the first check")
+    most: int = Field(150, ge=1, description="proposals that pass the first check")
     landmark_cell: float = Field(0.2, gt=0.0, description="anchors merged within, metres")
     landmark_turn: float = Field(math.radians(30.0), gt=0.0, description="and within, radians")
 

@@ -76,10 +76,10 @@ class VerificationSettings(BaseModel):
 
     second_readings: int = Field(28, ge=4, description="readings of the second check")
     third_readings: int = Field(80, ge=4, description="readings of the third check")
-    third_poses: int = Field(40, ge=1, description="poses that reach the third check")
+    third_poses: int = Field(25, ge=1, description="poses that reach the third check")
     fits: int = Field(7, ge=1, description="distinct poses that are refined")
     fit_readings: int = Field(72, ge=4, description="readings of the refinement")
-    iterations: int = Field(8, ge=0, description="steps of the refinement")
+    iterations: int = Field(6, ge=0, description="steps of the refinement")
     distinct_distance: float = Field(0.4, gt=0.0, description="poses nearer are one, metres")
     distinct_turn: float = Field(
         math.radians(15.0), gt=0.0, description="poses turned less are one, radians"
