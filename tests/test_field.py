@@ -556,6 +556,13 @@ def test_references_on_two_continents_are_an_error_that_says_so():
     assert len(together.tiles.pages) <= 4
 
 
+@pytest.mark.parametrize("x", [2e8, -6.97e41, 1e308])
+def test_a_reference_beyond_the_earth_is_an_error_that_says_so(x):
+    scan = drawn(box(-2.0, -1.0, 2.0, 1.0), sensor=EXACT)
+    with pytest.raises(AnchorscanError, match="km away; is its pose wrong"):
+        LikelihoodField(DEFAULT, [(scan, Pose2D(x, 0.0))])
+
+
 def test_what_several_changes_touch_is_derived_once_and_who_reads_first_has_it(monkeypatch):
     scans, others = placed(2, 7), placed(4, 8)
     derived = []

@@ -60,6 +60,8 @@ _CORNERS = 1.415
 _PAGE = 64  # squares along a side of a page of the table
 # So many pages cover fifty kilometres times fifty with cells of 5 cm.
 _MOST_PAGES = 1 << 16
+# Farther from the origin than any frame on the ground, metres; cells beyond it have no numbers.
+_FARTHEST = 1e8
 # So many squares at most wait to be derived: about fifty milliseconds for the next reader.
 _MOST_WAITING = 512
 # Tiles whose evidence is worked on at once, and rays that are deposited at once.
@@ -392,7 +394,10 @@ class LikelihoodField:
             hit or a pass, has changed.
         """
         size = self._settings.resolution
-        cells = np.concatenate([rays.origins, rays.ends]) / size
+        points = np.concatenate([rays.origins, rays.ends])
+        if (far := float(np.abs(points).max())) > _FARTHEST:
+            raise AnchorscanError(f"a reference lies {far / 1e3:.3g} km away; is its pose wrong?")
+        cells = points / size
         low = np.floor((cells.min(axis=0) - self._halo) / _SIDE)[::-1]
         high = np.floor((cells.max(axis=0) + self._halo) / _SIDE)[::-1] + 1
         self._cover(low - 1, high + 1)

@@ -8,6 +8,7 @@ and the value is the one that did best on the logs named in the module that uses
 from __future__ import annotations
 
 import difflib
+import functools
 import json
 import math
 import types
@@ -132,7 +133,7 @@ class Settings(BaseModel):
         """
         if name not in PRESETS:
             raise SettingsError(f"unknown preset {name!r}{_nearest(name, PRESETS)}")
-        return cls.model_validate(PRESETS[name])
+        return _preset(name)
 
     @classmethod
     def from_json(cls, text: str | bytes) -> Settings:
@@ -174,6 +175,11 @@ class Settings(BaseModel):
         if name := _immense(settings):
             raise SettingsError(f"{name}: is too large a number to be meant")
         return settings
+
+
+@functools.cache
+def _preset(name: str) -> Settings:
+    return Settings.model_validate(PRESETS[name])
 
 
 def _immense(model: BaseModel, path: str = "") -> str:

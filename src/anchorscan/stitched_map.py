@@ -140,16 +140,26 @@ class StitchedMap:
 
     def __init__(self, settings: Settings, known: Iterable[Known] = ()) -> None:
         self._begin(settings, _no_reading)
-        # The map is stitched while the references are still being described.
-        described = _Passed[tuple[LaserScan, Pose2D]]()
-        with ThreadPoolExecutor(1) as thread:
-            field = thread.submit(LikelihoodField, settings.field, described)
-            with described:
-                passed = (described.put(_placed(each.reference), each) for each in known)
-                lot = lot_of(map(self._remembered, passed), 0, settings.proposal)
-            self._field = field.result()
+        known = iter(known)
+        first = next(known, None)
+        if first is None:
+            lot = lot_of((), 0, settings.proposal)
+            self._field = LikelihoodField(settings.field)
+        else:
+            lot = self._stitch(chain((first,), known))
         self._next_serial = len(lot)
         self._hold((lot,))
+
+    def _stitch(self, known: Iterable[Known]) -> Lot:
+        """Stitch the map while the references are still being described."""
+        described = _Passed[tuple[LaserScan, Pose2D]]()
+        with ThreadPoolExecutor(1) as thread:
+            field = thread.submit(LikelihoodField, self._settings.field, described)
+            with described:
+                passed = (described.put(_placed(each.reference), each) for each in known)
+                lot = lot_of(map(self._remembered, passed), 0, self._settings.proposal)
+            self._field = field.result()
+        return lot
 
     @classmethod
     def from_arrays(

@@ -5,6 +5,7 @@ Whatever rosbags raises on damaged files ends here, as a `LogError` or as a repo
 
 from __future__ import annotations
 
+import functools
 import heapq
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack
@@ -210,10 +211,7 @@ class Recording:
 
     def _decoded(self, connection: Connection, data: bytes) -> Any:
         try:
-            decoder = self._decoders.get(connection.msgtype)
-            if decoder is None:
-                decoder = self._decoders[connection.msgtype] = self._decoder(connection)
-            message = decoder(data)
+            message = self._decoder(connection)(data)
             _check_fields(message, _READ.get(connection.msgtype, ()))
             for transform in getattr(message, "transforms", ()):
                 _check_fields(transform, _READ_OF_TRANSFORM)
@@ -222,24 +220,37 @@ class Recording:
             return f"the message cannot be decoded: {_first_line(error)}"
 
     def _decoder(self, connection: Connection) -> Callable[[bytes], Any]:
-        """Return the decoder of a message type, by the definition in the recording if it is there.
+        found = self._decoders.get(connection.msgtype)
+        if found is None:
+            from rosbags.interfaces import MessageDefinitionFormat
 
-        Only the types that are read are looked at: one definition that rosbags cannot parse
-        must not hide the scans beside it.
-        """
-        from rosbags.interfaces import MessageDefinitionFormat
-        from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+            definition = connection.msgdef
+            is_given = definition.format == MessageDefinitionFormat.MSG
+            text = definition.data if is_given else None
+            found = _decoder(connection.msgtype, text, is_ros1=self._is_ros1)
+            self._decoders[connection.msgtype] = found
+        return found
 
-        kind = connection.msgtype
-        if connection.msgdef.format == MessageDefinitionFormat.MSG:
-            store = get_typestore(Stores.EMPTY)
-            store.register(get_types_from_msg(connection.msgdef.data, kind))
-        else:
-            # The messages that are read here have not changed since the first ROS 2.
-            store = get_typestore(Stores.LATEST)
-        if self._is_ros1:
-            return lambda data: store.deserialize_ros1(data, kind)
-        return lambda data: store.deserialize_cdr(data, kind)
+
+@functools.lru_cache(maxsize=16)
+def _decoder(kind: str, definition: str | None, *, is_ros1: bool) -> Callable[[bytes], Any]:
+    """Return the decoder of a message type, by the definition in the recording if it is there.
+
+    Only the types that are read are looked at: one definition that rosbags cannot parse
+    must not hide the scans beside it.  Making one takes twenty milliseconds, and a recording is
+    opened several times.
+    """
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    if definition is not None:
+        store = get_typestore(Stores.EMPTY)
+        store.register(get_types_from_msg(definition, kind))
+    else:
+        # The messages that are read here have not changed since the first ROS 2.
+        store = get_typestore(Stores.LATEST)
+    if is_ros1:
+        return lambda data: store.deserialize_ros1(data, kind)
+    return lambda data: store.deserialize_cdr(data, kind)
 
 
 def _check_fields(message: Any, fields: Iterable[str]) -> None:
