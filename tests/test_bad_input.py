@@ -22,6 +22,7 @@ from scans import mirrored
 
 import anchorscan
 from anchorscan import (
+    Hypothesis,
     LaserScan,
     LogError,
     Matcher,
@@ -38,7 +39,9 @@ from anchorscan import (
     random_building,
 )
 from anchorscan.answers import read_runs
-from anchorscan.plausibility import Plausibility, mirror_check
+from anchorscan.localizer import Belief, Localizer
+from anchorscan.plausibility import MirrorWatch, Plausibility, mirror_check
+from anchorscan.robot import Robot
 from anchorscan.set_check import check
 from anchorscan.wrong_data import displaced
 
@@ -307,6 +310,72 @@ class TestWrongMeaning:
         assert not mirror_check(places, records).is_mirrored
         other = drive(random_building(9), seed=9, length=20.0)
         assert not mirror_check(places, other).is_mirrored
+
+    def test_a_robot_whose_laser_hangs_upside_down_is_located_nowhere_and_says_why(
+        self, records: list[Record]
+    ) -> None:
+        places = ReferenceSet.build(records)
+        other = [r for r in drive(random_building(5), seed=9, length=20.0) if r.scan is not None]
+        told = {}
+        for is_turned in (False, True):
+            robot = Robot(Localizer(places), mirror=MirrorWatch(places))
+            reports = []
+            for number, record in enumerate(other):
+                assert record.scan is not None
+                assert record.odometry is not None
+                robot.odometry.add(number, record.odometry)
+                scan = mirrored(record.scan) if is_turned else record.scan
+                reports.append(robot.take(scan, number))
+            told[is_turned] = [one.state for one in reports if one is not None].count("located")
+            assert ("upside down" in robot.doubt) == is_turned
+            robot.start_over()
+            assert not robot.doubt
+        assert told[False] > 0.3 * len(other)
+        assert told[True] == 0
+
+    def test_what_was_found_sure_is_withheld_from_a_laser_upside_down(self) -> None:
+        answer = Hypothesis(0, Pose2D(), Pose2D(), np.eye(3), 0, 0, 0.5, 0.99, True)
+
+        class Places:
+            def locate(self, scan: LaserScan) -> list[Hypothesis]:
+                return [replace(answer, score=1.0 if scan.angle_increment < 0.0 else 0.5)]
+
+        class Sure:
+            def update(self, scan: LaserScan, odometry: Pose2D | None, stamp: float) -> Belief:
+                return Belief((answer,), 0.01, True)
+
+            def reset(self) -> None: ...
+
+        scan = LaserScan.from_field_of_view([1.0, 2.0, 3.0], math.pi)
+        for robot, state in (
+            (Robot(Sure()), "located"),
+            (Robot(Sure(), mirror=MirrorWatch(Places())), "ambiguous"),
+        ):
+            report = robot.take(scan, 1.0)
+            assert report is not None
+            assert report.state == state
+
+    def test_a_robot_that_stands_still_is_asked_once_and_no_more_than_two_dozen_times(self) -> None:
+        asked = []
+
+        class Places:
+            def locate(self, scan: LaserScan) -> list[Hypothesis]:
+                asked.append(scan)
+                return [Hypothesis(0, Pose2D(), Pose2D(), np.eye(3), 0, 0, 0.5, 0.99, True)]
+
+        scan = LaserScan.from_field_of_view([1.0, 2.0, 3.0], math.pi)
+        watch = MirrorWatch(Places())
+        for _ in range(100):
+            watch.add(scan, Pose2D(1.0, 1.0))
+        assert len(asked) == 2  # once both ways
+        for number in range(100):
+            watch.add(scan, Pose2D(1.0 + number, 1.0))
+        assert len(asked) == 48
+        assert watch.found.as_given == 24
+        watch.reset()
+        for _ in range(33):
+            watch.add(scan)
+        assert len(asked) == 48 + 6
 
     def test_mirrored_scans_are_refused_unless_they_are_said_to_be(
         self, records: list[Record], tmp_path: Path

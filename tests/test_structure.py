@@ -50,7 +50,7 @@ ORDER = (
     ),
     *("localizer", "topological_localizer"),
     *("scan_message", "client", "shelf", "service_message"),
-    *("robot", "robot_parameters", "mailbox", "plausibility"),
+    *("plausibility", "robot", "robot_parameters", "mailbox"),
     *("explanation", "drawing", "answers"),
     *("sensor", "occupancy", "map_file", "world", "building", "simulator", "exhaustive_search"),
     *("karto_matcher", "monte_carlo", "stage_times", "scoreboard"),

@@ -22,7 +22,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import islice
 from statistics import median
 from typing import Protocol
@@ -34,6 +34,7 @@ from .scan import LaserScan
 
 __all__ = [
     "MirrorCheck",
+    "MirrorWatch",
     "Plausibility",
     "ScaleCheck",
     "mirror_check",
@@ -51,6 +52,8 @@ _SHORT_STEP, _NEAR_STEP = 0.05, 1.5
 _FEWEST_STEPS, _LEAST_CONSTANT = 30, 0.4
 # Scans that are asked both ways, of so many at the beginning.
 _LOOKED_AT, _ASKED = 400, 24
+# A scan so far from another, metres, is of another place; where nobody knows, so many later.
+_ELSEWHERE, _EVERY = 0.5, 16
 _MIRRORED_SHARE = 0.7
 # A third of the scans: more do not fit a map of quite another scale, fewer do not tell one.
 _THIRD = 1.0 / 3.0
@@ -164,6 +167,21 @@ class MirrorCheck:
     as_given: int
     mirrored: int
 
+    def with_scan(self, places: _Places, scan: LaserScan) -> MirrorCheck:
+        """Return what is found with one more scan, located both ways."""
+        here, there = places.locate(scan)[:1], places.locate(mirror_image(scan))[:1]
+        if not (here and there):
+            return self
+        if there[0].score > here[0].score:
+            return replace(self, mirrored=self.mirrored + there[0].accepted)
+        return replace(self, as_given=self.as_given + here[0].accepted)
+
+    def __str__(self) -> str:
+        """As the middle of a message."""
+        fitting = self.as_given + self.mirrored
+        share = f"{self.mirrored} of {fitting} that fit at all"
+        return f"its scans fit the set as their mirror images ({share})"
+
     @property
     def is_mirrored(self) -> bool:
         """Whether the scans are mirrored, beyond reasonable doubt."""
@@ -179,17 +197,59 @@ def mirror_check(places: _Places, records: Iterable[Record]) -> MirrorCheck:
         records: The recording, from its beginning.
     """
     scans = [record.scan for record in islice(records, _LOOKED_AT) if record.scan is not None]
-    as_given = mirrored = 0
+    found = MirrorCheck(0, 0)
     for scan in scans[:: max(1, len(scans) // _ASKED)]:
-        here, there = places.locate(scan)[:1], places.locate(mirror_image(scan))[:1]
-        if not (here and there):
-            continue
-        better, is_mirrored = here[0], False
-        if there[0].score > here[0].score:
-            better, is_mirrored = there[0], True
-        as_given += better.accepted and not is_mirrored
-        mirrored += better.accepted and is_mirrored
-    return MirrorCheck(as_given, mirrored)
+        found = found.with_scan(places, scan)
+    return found
+
+
+class MirrorWatch:
+    """Asks of a robot on the move whether its laser hangs upside down and nobody said so.
+
+    Scans that were taken half a metre apart, by odometry, or one of sixteen where there is none,
+    are located both ways, until two dozen of them are: some milliseconds each, and then none.
+
+    Args:
+        places: Where they are sought.
+
+    Attributes:
+        found: What was found so far.
+    """
+
+    def __init__(self, places: _Places) -> None:
+        self._places = places
+        self.reset()
+
+    def reset(self) -> None:
+        """Know nothing of the laser."""
+        self.found = MirrorCheck(0, 0)
+        self._last: Pose2D | None = None
+        self._unasked = _EVERY
+
+    def add(self, scan: LaserScan, T_odom_laser: Pose2D | None = None) -> None:
+        """Look at the next scan."""
+        if self._is_done or not self._is_elsewhere(T_odom_laser):
+            return
+        self._last, self._unasked = T_odom_laser, 0
+        self.found = self.found.with_scan(self._places, scan)
+
+    @property
+    def is_doubtful(self) -> bool:
+        """Whether answers must not be trusted, as far as is known now."""
+        if self._is_done:
+            return self.found.is_mirrored
+        return self.found.mirrored > self.found.as_given
+
+    @property
+    def _is_done(self) -> bool:
+        return self.found.as_given + self.found.mirrored >= _ASKED
+
+    def _is_elsewhere(self, T_odom_laser: Pose2D | None) -> bool:
+        """Tell whether the scan says something that the one asked last does not."""
+        if T_odom_laser is not None and self._last is not None:
+            return self._last.distance(T_odom_laser) >= _ELSEWHERE
+        self._unasked += 1
+        return self._unasked >= _EVERY
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,9 @@ knows nothing of ROS:
 - odometry that jumps farther than a robot can drive ends the belief, not the announcement;
 - answers are those of the robot's base: ``T_map_base = T_map_laser @ T_laser_base``, with the
   covariance carried along, since a laser ahead of the base turns a doubt about the heading
-  into one about the position.
+  into one about the position;
+- scans that fit the map as their mirror images are of a laser upside down: then nothing is
+  located.
 """
 
 from __future__ import annotations
@@ -19,13 +21,14 @@ from __future__ import annotations
 import math
 import threading
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .localizer import Belief
+from .plausibility import MirrorWatch
 from .pose import Pose2D, wrap_angle
 from .reference_set import ReferenceSet
 from .scan import LaserScan
@@ -165,6 +168,7 @@ class Robot:
     Args:
         tracker: The belief.
         odometry: History to go on with; a new one if None.
+        mirror: What asks whether the laser hangs upside down; nobody does if None.
 
     Attributes:
         odometry: Where the base is by odometry.
@@ -173,8 +177,14 @@ class Robot:
         late: Scans left out because a newer one had been taken.
     """
 
-    def __init__(self, tracker: Tracker, odometry: Odometry | None = None) -> None:
+    def __init__(
+        self,
+        tracker: Tracker,
+        odometry: Odometry | None = None,
+        mirror: MirrorWatch | None = None,
+    ) -> None:
         self._tracker = tracker
+        self._mirror = mirror
         self.odometry = odometry or Odometry()
         self._breaks = self.odometry.breaks
         self._last = -math.inf
@@ -203,7 +213,18 @@ class Robot:
         T_odom_base = self.odometry.at(stamp)
         T_odom_laser = None if T_odom_base is None else T_odom_base @ T_base_laser
         belief = self._tracker.update(scan, T_odom_laser, stamp)
-        return _report(belief, stamp, T_base_laser, T_odom_base)
+        report = _report(belief, stamp, T_base_laser, T_odom_base)
+        if self._mirror is not None:
+            self._mirror.add(scan, T_odom_laser)
+        is_withheld = report.state == "located" and bool(self.doubt)
+        return replace(report, state="ambiguous") if is_withheld else report
+
+    @property
+    def doubt(self) -> str:
+        """Why nothing is located though a place was found, "" where nothing speaks against it."""
+        if self._mirror is None or not self._mirror.is_doubtful:
+            return ""
+        return f"may hang upside down without anybody having said so: {self._mirror.found}"
 
     def watch_clock(self, stamp: float) -> None:
         """Start over when the time of a scan, taken or not, shows that the clock went back."""
@@ -213,6 +234,8 @@ class Robot:
     def start_over(self) -> None:
         """Forget where the robot is, and that anybody was told."""
         self._tracker.reset()
+        if self._mirror is not None:
+            self._mirror.reset()
         self._last = -math.inf
         self.is_announced = False
 

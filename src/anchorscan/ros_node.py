@@ -31,6 +31,7 @@ from .io.spatial import matrix_of, planar, tilt
 from .localizer import Localizer
 from .mailbox import Closed, Mailbox
 from .occupancy import OccupancyGrid, reference_scans
+from .plausibility import MirrorWatch
 from .pose import Pose2D
 from .reference_set import ReferenceSet
 from .robot import Report, Robot, SingleScans
@@ -352,6 +353,9 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
             return False, f"the newest scan is unusable: {error}"
         with self._lock:
             robot, last = self._robot, self._report
+            doubt = "" if robot is None else robot.doubt
+        if doubt:
+            return False, f"the laser {doubt}"
         odometry = None if robot is None else robot.odometry
         report = Robot(SingleScans(places), odometry).take(scan, self._stamp(message), T_base_laser)
         assert report is not None
@@ -430,7 +434,8 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
         """Locate among other references from now on, with nothing known in them."""
         with self._lock:
             odometry = None if self._robot is None else self._robot.odometry
-            self._places, self._robot = places, Robot(Localizer(places), odometry)
+            self._places = places
+            self._robot = Robot(Localizer(places), odometry, MirrorWatch(places))
             self._report = None
 
     def _use_scan(self, message: Any) -> None:
@@ -454,6 +459,11 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
             if report is None:
                 return
             self._report = report
+            doubt = robot.doubt
+        if doubt:
+            self._complain("laser", f"{doubt}; see /tf, or laser_is_upside_down")
+        else:
+            self._mend("laser")
         self._tell(robot, report, message.header.stamp)
 
     def _scan(self, message: Any) -> tuple[LaserScan, Pose2D]:
@@ -613,6 +623,8 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
             yield error, f"no scan on {options.scan_topic} for {silence:.0f} s"
         if "scan" in self._complaints:
             yield warning, f"the scan {self._complaints['scan']}"
+        if "laser" in self._complaints:
+            yield error, f"the laser {self._complaints['laser']}"
         if "map" in self._complaints:
             yield warning, f"the map {self._complaints['map']}; the old one is used"
         if self._robot is not None and self._robot.is_announced and not options.continuous:

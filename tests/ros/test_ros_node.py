@@ -351,6 +351,20 @@ def test_garbage_is_counted_named_and_survived(
     assert recording.is_right(observer.heard["initialpose"][0])
 
 
+def test_a_laser_upside_down_is_named_and_nothing_is_told(
+    observer: Observer, start: Start, recording: Recording, map_file: str
+) -> None:
+    start(laser_pose=LASER_POSE, laser_is_upside_down=True)  # it stands
+    robot = start(player)
+    observer.listen()
+    robot.tell(do="map", file=map_file)
+    awake(observer)
+    observer.wait(lambda: observer.values().get("references", "0") != "0", "no references")
+    robot.tell(do="play", file=recording.path, first=0, last=len(recording.stamps))
+    observer.wait(lambda: "mirror" in observer.values().get("problem: laser", ""), "no complaint")
+    assert observer.heard["initialpose"] == []
+
+
 def test_another_sensor_and_a_clock_that_goes_back(
     observer: Observer,
     start: Start,

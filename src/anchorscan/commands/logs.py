@@ -86,8 +86,7 @@ def refuse_mirrored(places: ReferenceSet, log: Log) -> None:
     found = mirror_check(places, log)
     if found.is_mirrored:
         raise LogError(
-            f"its scans fit the set as their mirror images ({found.mirrored} of "
-            f"{found.mirrored + found.as_given} that fit at all): one of the two was recorded with "
+            f"{found}: one of the two was recorded with "
             "the laser upside down, or was said to be (--upside-down)",
             log.path,
         )
