@@ -36,8 +36,9 @@ _NEAR, _UNKNOWN = FEATURES.index("near"), FEATURES.index("unknown")
 _AWAY, _TURNED = 0.5, math.radians(20.0)
 # Shares of the readings; chosen on intel, freiburg-079 and wean, the others had no part in that.
 _CLEARLY_BETTER = 0.2
-_TOO_FEW_NEAR = 0.6
 _UNSEEN = 0.5
+# Of the readings in places that others saw, if these are enough.
+_TOO_FEW_NEAR, _FEWEST_SEEN = 0.5, 0.15
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,6 +57,7 @@ class ReferenceCheck:
     reference: Reference
     verdict: Verdict
     near: float
+    seen: float
     elsewhere: Pose2D | None = None
     near_elsewhere: float = math.nan
 
@@ -67,7 +69,10 @@ class ReferenceCheck:
         assert pose is not None
         begin = f"reference {reference.identifier}{name} at {_place(pose)}: {self.verdict}"
         if self.elsewhere is None:
-            return f"{begin}; {100.0 * self.near:.0f} % of its readings agree with the others"
+            return (
+                f"{begin}; {100.0 * self.near:.0f} % of its readings agree with the others, "
+                f"{100.0 * self.seen:.0f} % end in places that they saw"
+            )
         away = pose.distance(self.elsewhere)
         return (
             f"{begin}; it fits at {_place(self.elsewhere)}, {away:.1f} m away: "
@@ -125,19 +130,20 @@ def _judge(reference: Reference, others: Matcher) -> ReferenceCheck:
     pose = reference.pose
     assert pose is not None
     if not reference.scan.is_return.any():
-        return ReferenceCheck(reference, "alone", math.nan)
+        return ReferenceCheck(reference, "alone", math.nan, 0.0)
     here = others.follow(reference.scan, pose.to_array()[None], np.zeros((1, 3, 3)))
     near, unknown = here.features[0, [_NEAR, _UNKNOWN]].tolist()
+    seen = 1.0 - unknown
     trace = others.explain(reference.scan)
     best = trace.hypotheses[0] if trace.hypotheses else None
     if best is not None and best.accepted and best.pose is not None and trace.in_map is not None:
         near_there = float(trace.in_map.fits.features[0, _NEAR])
         is_away = best.pose.distance(pose) > _AWAY or best.pose.turn(pose) > _TURNED
         if is_away and near_there - near > _CLEARLY_BETTER:
-            return ReferenceCheck(reference, "misplaced", near, best.pose, near_there)
-    if unknown >= _UNSEEN:
-        return ReferenceCheck(reference, "alone", near)
-    return ReferenceCheck(reference, "contradicted" if near < _TOO_FEW_NEAR else "sound", near)
+            return ReferenceCheck(reference, "misplaced", near, seen, best.pose, near_there)
+    if seen >= _FEWEST_SEEN and near < _TOO_FEW_NEAR * seen:
+        return ReferenceCheck(reference, "contradicted", near, seen)
+    return ReferenceCheck(reference, "alone" if unknown >= _UNSEEN else "sound", near, seen)
 
 
 def _place(pose: Pose2D) -> str:
