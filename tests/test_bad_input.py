@@ -22,6 +22,7 @@ from scans import mirrored
 
 import anchorscan
 from anchorscan import (
+    AnchorscanError,
     Hypothesis,
     LaserScan,
     LogError,
@@ -206,6 +207,28 @@ class TestWhatFuzzingFound:
         path.write_bytes(seeds.bags()[0].replace(name, name[:-1] + b"q"))
         with pytest.raises(LogError, match=f"no (header.)?{name.decode()} that can be read"):
             open_log(path)
+
+    @pytest.mark.parametrize(
+        ("right", "wrong"),
+        [(b"message_count: 2\n    topic", b"message_count: 2|\n    topic"), (b"/scan", b"[]")],
+    )
+    def test_a_recording_whose_metadata_say_no_number_or_name_is_an_error(
+        self, right: bytes, wrong: bytes, tmp_path: Path
+    ) -> None:
+        pytest.importorskip("rosbags")
+        (metadata,) = seeds.metadata()
+        assert metadata != metadata.replace(right, wrong)
+        (tmp_path / "metadata.yaml").write_bytes(metadata.replace(right, wrong))
+        (tmp_path / "run.db3").write_bytes(seeds.storage())
+        with pytest.raises(LogError, match="cannot be read as a recording"):
+            open_log(tmp_path)
+
+    def test_a_reference_beyond_the_earth_is_an_error_even_if_it_shows_nothing(self) -> None:
+        nothing = LaserScan(np.empty(0, np.float32), 0.0, 0.1)
+        places = ReferenceSet()
+        places.add(nothing, Pose2D(3.0, 2e307, 0.0))
+        with pytest.raises(AnchorscanError, match="km away"):
+            places.locate(LaserScan.from_field_of_view([1.0, 2.0, 3.0], math.pi))
 
 
 class _Trap:

@@ -361,14 +361,13 @@ class LikelihoodField:
         batch: list[_Rays] = []
         count = 0
         for scan, pose in scans:
+            _check_pose(pose)
             points = scan.points
             points = points[np.hypot(points[:, 0], points[:, 1]) <= self._settings.farthest]
             if not len(points):
                 continue
-            ends = pose.apply(points)
-            if not np.isfinite(ends).all():
-                raise AnchorscanError("a reference has a pose that is not finite")
-            rays = _Rays(np.repeat([[pose.x, pose.y]], len(points), axis=0), ends)
+            origins = np.repeat([[pose.x, pose.y]], len(points), axis=0)
+            rays = _Rays(origins, pose.apply(points))
             if batch and (count > _MANY_RAYS or self._are_apart(batch[0], rays)):
                 yield _Rays(*map(np.concatenate, zip(*batch, strict=True)))
                 batch, count = [], 0
@@ -394,10 +393,7 @@ class LikelihoodField:
             hit or a pass, has changed.
         """
         size = self._settings.resolution
-        points = np.concatenate([rays.origins, rays.ends])
-        if (far := float(np.abs(points).max())) > _FARTHEST:
-            raise AnchorscanError(f"a reference lies {far / 1e3:.3g} km away; is its pose wrong?")
-        cells = points / size
+        cells = np.concatenate([rays.origins, rays.ends]) / size
         low = np.floor((cells.min(axis=0) - self._halo) / _SIDE)[::-1]
         high = np.floor((cells.max(axis=0) + self._halo) / _SIDE)[::-1] + 1
         self._cover(low - 1, high + 1)
@@ -521,6 +517,19 @@ class LikelihoodField:
         directory[i, j] = new
         self._pages = directory
         self._table[directory[pages[:, 0], pages[:, 1]], at] = tiles
+
+
+def _check_pose(pose: Pose2D) -> None:
+    """See that a reference lies where there are cells.
+
+    Raises:
+        AnchorscanError: It does not.
+    """
+    if not pose.is_finite():
+        raise AnchorscanError("a reference has a pose that is not finite")
+    away = max(abs(pose.x), abs(pose.y))
+    if away > _FARTHEST:
+        raise AnchorscanError(f"a reference lies {away / 1e3:.3g} km away; is its pose wrong?")
 
 
 def _grown(layer: NDArray, room: int) -> NDArray:  # type: ignore[type-arg]

@@ -91,6 +91,7 @@ class Recording:
         make: Callable[[Path], Any] = rosbag1.Reader if self._is_ros1 else rosbag2.Reader
         try:
             self._readers = [self._stack.enter_context(make(part)) for part in self._parts]
+            _check_connections(self._connections())
         except Exception as error:
             self._stack.close()
             raise LogError(
@@ -251,6 +252,19 @@ def _decoder(kind: str, definition: str | None, *, is_ros1: bool) -> Callable[[b
     if is_ros1:
         return lambda data: store.deserialize_ros1(data, kind)
     return lambda data: store.deserialize_cdr(data, kind)
+
+
+def _check_connections(connections: Iterable[Connection]) -> None:
+    """Check what a recording says of its topics, which rosbags takes as it is written.
+
+    Raises:
+        ValueError: It cannot be meant.
+    """
+    for connection in connections:
+        if not (isinstance(connection.topic, str) and isinstance(connection.msgtype, str)):
+            raise ValueError("a topic has no name or no type")
+        if not isinstance(connection.msgcount, int):
+            raise ValueError(f"it is not said how many messages are on {connection.topic[:60]!r}")
 
 
 def _check_fields(message: Any, fields: Iterable[str]) -> None:
