@@ -74,7 +74,7 @@ define test_with
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check uv
 	$(PYTHON) -m venv --clear --without-pip $(2)
 	$(BIN)/uv pip install --quiet --python $(2)/bin/python --resolution $(1) \
-		-e ".[bags,maps,plot]" "rtb-data>=1.0" "pytest>=8" "hypothesis>=6.100"
+		-e ".[bags,fleet,maps,plot,service]" "rtb-data>=1.0" "pytest>=8" "hypothesis>=6.100"
 	$(2)/bin/python -m pytest $(PYTEST_ARGS)
 endef
 

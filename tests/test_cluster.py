@@ -85,6 +85,11 @@ def test_a_cluster_gives_what_one_process_gives(two_workers: Spread) -> None:
     assert shown(two_workers) == shown(Spread())
 
 
+def test_what_is_held_is_shared_evenly(two_workers: Spread) -> None:
+    (holding,) = two_workers.ask(_process, two_workers.hold(str, "abcdefghijkl"), [0])
+    assert [holding.count(each) for each in set(holding)] == [6, 6]
+
+
 def test_what_cannot_be_held_is_a_known_error(two_workers: Spread, tmp_path: Path) -> None:
     for spread in (Spread(), two_workers):
         with pytest.raises(AnchorscanError, match=r"five\.log"):
@@ -176,6 +181,23 @@ def _place(found: BuildingHypothesis) -> object:
 
 def _process(_: str, __: int) -> int:
     return os.getpid()
+
+
+def _ended(_: str, __: int) -> None:
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def test_workers_that_are_killed_one_after_the_other_come_back() -> None:
+    dask = pytest.importorskip("dask", reason="the cluster is an extra")
+    # Dask itself would give up a worker that is down ten milliseconds after it was lost.
+    with (
+        dask.config.set({"distributed.deploy.lost-worker-timeout": "10ms"}),
+        cluster(workers=1) as spread,
+    ):
+        with pytest.raises(AnchorscanError, match="several workers died"):
+            list(spread.ask(_ended, spread.hold(str, "a"), [0]))
+        (again,) = spread.ask(_process, spread.hold(str, "a"), [0])
+        assert again != [os.getpid()]
 
 
 def _timeless(answer: benchmark.Answer) -> object:

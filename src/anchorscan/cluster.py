@@ -35,6 +35,9 @@ _LOST = (OSError, RuntimeError, asyncio.TimeoutError)
 _DEATHS = 3
 # Seconds until nobody answers: a scheduler, or a worker that is to hold something.
 _PATIENCE = 60
+# Dask looks at a worker of this machine once, so long after it was lost, and never starts it again
+# if it happens to be down just then: killed for a second time, or slow to start.
+_LOOKED_AT_AGAIN = {"distributed.deploy.lost-worker-timeout": "1d"}
 
 
 @dataclass(frozen=True)
@@ -65,7 +68,7 @@ class Spread:
     @property
     def workers(self) -> int:
         """How many workers there are now; 0 where all is done here."""
-        return 0 if self._client is None else len(self._client.scheduler_info(-1)["workers"])
+        return 0 if self._client is None else len(self._client.nthreads())
 
     def map(
         self, function: Callable[[Item], Result], items: Iterable[Item]
@@ -101,7 +104,12 @@ class Spread:
         Raises:
             AnchorscanError: The first known error that one of them ended with.
         """
-        holders = [Holder(make, item, n, self._client) for n, item in enumerate(items)]
+        workers = [] if self._client is None else sorted(self._client.nthreads())
+        wishes = workers if len(workers) > 1 else [None]
+        holders = [
+            Holder(make, item, self._client, wishes[n % len(wishes)])
+            for n, item in enumerate(items)
+        ]
         list(self.ask(_nothing, holders, [None]))
         return holders
 
@@ -142,16 +150,17 @@ class Holder(Generic[Held]):
     Args:
         make: Of a module.
         item: What to make it from.
-        number: Which of the workers begins.
         client: Of Dask; None holds it here.
+        wish: Address of the worker that is to hold it; whichever Dask chooses if None.
     """
 
-    def __init__(self, make: Callable[[Any], Held], item: object, number: int, client: Any) -> None:
+    def __init__(
+        self, make: Callable[[Any], Held], item: object, client: Any, wish: str | None = None
+    ) -> None:
         self._recipe = (make, item)
-        self._number = number
         self._client = client
         self._made: Any = None
-        self._make()
+        self._make(wish)
 
     def ask(self, function: Callable[[Held, Any], Any], question: object) -> tuple[Any, Any]:
         """Put a question; ``answer`` waits for what this returns."""
@@ -181,24 +190,26 @@ class Holder(Generic[Held]):
             except _LOST as error:
                 died = error
             if made is self._made:
-                self._number += 1
                 self._make()
             made, answer = self.ask(function, question)
         raise AnchorscanError(f"several workers died of the same question: {died}") from died
 
-    def _make(self) -> None:
+    def _make(self, wish: str | None = None) -> None:
+        """Have it made, anew without a wish.
+
+        Dask gives what was wished for a worker that has died to another one that is there, but
+        never to one that comes later.
+        """
         if self._client is None:
             self._made = _Held(*self._recipe)
             return
-        workers = sorted(self._client.scheduler_info(-1)["workers"])
-        first = workers[self._number % max(len(workers), 1) :][:1]  # none: whichever comes
         self._made = self._client.submit(
             _Held,
             *self._recipe,
             actor=True,
             pure=False,
-            workers=first or None,
-            allow_other_workers=bool(first),
+            workers=wish and [wish],
+            allow_other_workers=wish is not None,
         )
 
 
@@ -240,6 +251,7 @@ def cluster(scheduler: str | None = None, workers: int | None = None) -> Iterato
     if scheduler is not None and workers is not None:
         raise AnchorscanError("name a scheduler or a number of workers, not both")
     try:
+        import dask
         import distributed
     except ImportError as error:
         raise MissingExtraError("a cluster", "fleet") from error
@@ -254,6 +266,7 @@ def cluster(scheduler: str | None = None, workers: int | None = None) -> Iterato
             yield Spread(client)
         return
     with (
+        dask.config.set(_LOOKED_AT_AGAIN),
         start(
             n_workers=workers,
             threads_per_worker=1,
