@@ -143,7 +143,7 @@ def _log(data: bytes, folder: Path) -> None:
 
 
 _CLOCK = "PARAM laser_front_laser_resolution 1.0 1.0 host 0\n" + "".join(
-    f"FLASER 3 1 2 3 {i} 0 0 {2 * i} 0 0 {i} host {i}\n" for i in range(3)
+    f"FLASER 3 1 2 3 {i} 0 0 {2 * i} 0 0 {i}.5 host {i}\n" for i in range(2)
 )
 
 
