@@ -122,6 +122,21 @@ def test_a_turned_sensor_gives_the_turned_pose(number, k, turn):
     assert around.pose.turn(expected) < math.radians(0.5)
 
 
+def test_expected_poses_take_steps_of_their_own():
+    references, asked = BUILT[0]
+    scan, truth = asked[0]
+    expected = (truth @ Pose2D(0.25, 0.1, 0.05)).to_array()[None]
+    loose = np.zeros((1, 3, 3))
+    moved = {}
+    for steps, own in ((0, 8), (6, 8), (6, 0)):
+        changed = {"verification": {"iterations": steps, "follow_iterations": own}}
+        matcher = Matcher(references, Settings.preset("default").changed(changed))
+        moved[steps, own] = matcher.follow(scan, expected, loose).poses[0]
+    assert np.array_equal(moved[0, 8], moved[6, 8])
+    assert Pose2D.from_array(moved[6, 8]).distance(truth) < 0.05
+    assert np.allclose(moved[6, 0], expected[0])
+
+
 # What may not change it.
 
 

@@ -37,7 +37,7 @@ from anchorscan.verification import _distinct as distinct
 FIELD = Settings.preset("default").field
 WEIGHTS = FIELD.weights()
 LIMITS = VerificationSettings()
-SMALL = VerificationSettings(third_poses=6, fits=4, iterations=2, rays=8)
+SMALL = VerificationSettings(third_poses=6, fits=4, iterations=2, follow_iterations=2, rays=8)
 SCORE, THROUGH = FEATURES.index("score"), FEATURES.index("through")
 NOBODY = np.empty((0, 3))
 

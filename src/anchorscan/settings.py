@@ -87,6 +87,7 @@ PRESETS: Mapping[str, Mapping[str, Any]] = types.MappingProxyType(
                 "fits": 20,
                 "fit_readings": 360,
                 "iterations": 12,
+                "follow_iterations": 12,
                 "last_readings": 360,
                 "rays": 180,
             },

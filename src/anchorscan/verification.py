@@ -80,6 +80,9 @@ class VerificationSettings(BaseModel):
     fits: int = Field(7, ge=1, description="distinct poses that are refined")
     fit_readings: int = Field(72, ge=4, description="readings of the refinement")
     iterations: int = Field(6, ge=0, description="steps of the refinement")
+    follow_iterations: int = Field(
+        8, ge=0, description="the same of expected poses, which may have farther to go"
+    )
     distinct_distance: float = Field(0.4, gt=0.0, description="poses nearer are one, metres")
     distinct_turn: float = Field(
         math.radians(15.0), gt=0.0, description="poses turned less are one, radians"
@@ -247,7 +250,7 @@ def follow(
     Returns:
         A fit for every pose, in their order; rays are followed for all of them.
     """
-    steps = (settings.fit_readings, settings.iterations, settings.last_readings)
+    steps = (settings.fit_readings, settings.follow_iterations, settings.last_readings)
     rays = (settings.rays, settings.through_margin)
     alike = np.column_stack((points, np.zeros(len(points))))
     found = _follow(poses, stiffness, alike, tiles, weights, steps, rays)
