@@ -7,7 +7,7 @@ from collections import Counter
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from anchorscan.panorama import _DISTANCES, _UNITS, DIRECTIONS, panorama
@@ -84,6 +84,7 @@ def plain_weights(seen):
 
 
 @given(st.integers(0, 1 << 30))
+@settings(max_examples=25)
 def test_a_bit_is_set_where_walls_weigh_enough(seed):
     seen = random_panorama(seed)
     found = lengths_of(spacings(seen[None])[0])
