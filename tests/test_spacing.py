@@ -10,8 +10,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from anchorscan.database import WORDS
 from anchorscan.panorama import _DISTANCES, _UNITS, DIRECTIONS, panorama
-from anchorscan.spacing import WORDS, spacings
+from anchorscan.spacing import spacings
 
 SAME, FACING, BACKS = range(3)
 

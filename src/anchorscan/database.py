@@ -37,7 +37,10 @@ from .graph import AnchorGraph
 from .length_relation import LengthRelation, corresponding_lengths
 from .oriented_relation import OrientedRelation, OrientedSettings
 
-__all__ = ["DatabaseSettings", "RelationshipDatabase", "Votes", "quality"]
+__all__ = ["WORDS", "DatabaseSettings", "RelationshipDatabase", "Votes", "quality"]
+
+WORDS = 3
+"""Integers of 64 bits that hold the spacings of a scan (``spacing``)."""
 
 # A part is merged into the one before it once it is more than this share of that: larger
 # shares make fewer parts to search, smaller ones less to copy.
@@ -54,11 +57,9 @@ _BINS = 4096
 _BINS_OF_ONE = 2048.0
 # References have at most about so many edges; the quality of larger ones takes longer.
 _SIZES = 512
-
-# Of a scan, as ``spacing`` gives them.
-_WORDS = 3
 # Logarithm of the quality and likeness of the spacings choose together.
-_PER_VOTE, _LEAST_QUALITY = 0.3, 1e-6
+_PER_VOTE = 0.3
+_LEAST_QUALITY = 1e-6
 
 Number = TypeVar("Number", np.int32, np.int64, np.uint64)
 
@@ -168,9 +169,9 @@ class RelationshipDatabase:
                 yield graph
 
         edges, sizes = self._relation.edges(in_slots(), 0)
-        saw = np.array(list(spacings), np.uint64).reshape(-1, _WORDS)
+        saw = np.array(list(spacings), np.uint64).reshape(-1, WORDS)
         if not len(saw):
-            saw = np.zeros((len(sizes), _WORDS), np.uint64)
+            saw = np.zeros((len(sizes), WORDS), np.uint64)
         self._state = self._beginning(edges, sizes, np.array(identifiers, np.int64), saw)
 
     @classmethod
@@ -192,7 +193,7 @@ class RelationshipDatabase:
             raise ValueError("arrays of references are missing")
         if identifiers.dtype != np.int64 or sizes.dtype != np.int32 or identifiers.ndim != 1:
             raise ValueError("arrays of references are of another kind")
-        if saw.dtype != np.uint64 or saw.shape != (len(identifiers), _WORDS):
+        if saw.dtype != np.uint64 or saw.shape != (len(identifiers), WORDS):
             raise ValueError("arrays of references are of another kind")
         if identifiers.shape != sizes.shape or (len(sizes) and sizes.min() < 0):
             raise ValueError("arrays of references do not fit together")
@@ -369,20 +370,30 @@ def _in_order(
 
 
 @kernel
+def _pairs(size, edges):  # type: ignore[no-untyped-def]
+    """Edges of a scan times those of a reference, one at least, that q_m is relative to."""
+    return max(np.float64(edges[0]) * max(size, edges[1]), 1.0)
+
+
+@kernel
+def _quality(count, size, edges):  # type: ignore[no-untyped-def]
+    """The q_m of a reference of so many edges."""
+    return np.float64(count) ** 2 / _pairs(size, edges)
+
+
+@kernel
 def _qualities(slots, counts, identifiers, sizes, edges):  # type: ignore[no-untyped-def]
     """Identifiers, counts and qualities of those slots whose reference is not removed."""
     alive = np.empty(len(slots), np.int64)
     found = np.empty(len(slots), np.float32)
-    quality = np.zeros(len(slots))
+    quality = np.empty(len(slots))
     used = 0
     for k in range(len(slots)):
         size = sizes[slots[k]]
         if size < 0:
             continue
         alive[used], found[used] = identifiers[slots[k]], counts[k]
-        pairs = np.float64(edges[0]) * max(size, edges[1])
-        if pairs > 0.0:
-            quality[used] = np.float64(counts[k]) ** 2 / pairs
+        quality[used] = _quality(counts[k], size, edges)
         used += 1
     return alive[:used], found[:used], quality[:used]
 
@@ -434,8 +445,7 @@ def _scores(slots, counts, known, edges, spacings):  # type: ignore[no-untyped-d
         if size < 0:
             scores[k] = -np.inf
             continue
-        pairs = np.float64(edges[0]) * max(size, edges[1], 1)
-        quality = np.float64(counts[k]) ** 2 / max(pairs, 1.0)
+        quality = _quality(counts[k], size, edges)
         of_x, of_y, of_back = saw[slots[k], 0], saw[slots[k], 1], saw[slots[k], 2]
         straight = _bits(of_x & x) + _bits(of_y & y) + _bits(of_back & back)
         across = _bits(of_x & y) + _bits(of_y & x) + _bits(of_back & kcab)
@@ -464,8 +474,7 @@ def _promising(slots, counts, sizes, edges, most):  # type: ignore[no-untyped-de
     # A root and a division for each size instead of each slot.
     shares = np.empty(_SIZES)
     for size in range(_SIZES):
-        pairs = np.float64(edges[0]) * max(size, edges[1], 1)
-        shares[size] = _BINS_OF_ONE / math.sqrt(pairs) if pairs > 0.0 else 0.0
+        shares[size] = _BINS_OF_ONE / math.sqrt(_pairs(size, edges))
     scale = np.empty(len(counts), np.int32)
     reached = np.zeros(_BINS, np.int64)
     for k in range(len(slots)):
@@ -476,7 +485,7 @@ def _promising(slots, counts, sizes, edges, most):  # type: ignore[no-untyped-de
         if size < _SIZES:
             root = counts[k] * shares[size]
         else:
-            root = counts[k] * _BINS_OF_ONE / math.sqrt(np.float64(edges[0]) * max(size, edges[1]))
+            root = counts[k] * _BINS_OF_ONE / math.sqrt(_pairs(size, edges))
         scale[k] = min(int(root), _BINS - 1)
         reached[scale[k]] += 1
     least, enough = _BINS, 0

@@ -38,11 +38,11 @@ from numpy.typing import NDArray
 from .anchors import AnchorPoints, AnchorStack, stack_anchors
 from .array_file import read_arrays, write_arrays
 from .database import RelationshipDatabase, Votes
-from .description import Description, Look, describe, looks
+from .description import Description, describe
 from .errors import AnchorscanError, MissingExtraError
 from .field import LikelihoodField
 from .graph import AnchorGraph
-from .panorama import DIRECTIONS, panorama, reordered, worth
+from .panorama import DIRECTIONS, View, panorama, worth
 from .pose import Pose2D
 from .proposal import joined, landmarks, proposals
 from .protocol import is_correct, thin
@@ -51,6 +51,7 @@ from .scan import LaserScan
 from .settings import Settings
 from .simulator import SensorModel, random_building, random_poses, simulate
 from .spacing import spacings
+from .stitched_map import candidates
 from .verification import on_large, readings, verify
 
 __all__ = ["RANKS", "SIZES", "Growth", "Place", "Scene", "Size", "distractors", "measure", "slope"]
@@ -550,23 +551,21 @@ class _Search:
     def votes(self, description: Description) -> Votes:
         """The best candidates for a scan, best first."""
         most = RANKS[-1] + _PASSED_OVER
-        seen = looks(description, self._asked.settings)
-        return reordered([self._compared(look, most) for look in seen], most)
 
-    def _compared(self, look: Look, most: int) -> tuple[Votes, NDArray[np.float64]]:
-        """Votes, and what the first of these are worth."""
-        compared = self._asked.settings.database.compared
-        votes = self._database.votes(look.graph, max(most, compared), look.spacings)
-        first, quality = votes.references[:compared], votes.quality[:compared]
-        worths = np.empty(len(first))
-        of_crowd = first >= _FIRST_DISTRACTOR
-        for known, those, begin in (
-            (self._crowd, of_crowd, _FIRST_DISTRACTOR),
-            (self._asked.seen, ~of_crowd, 0),
-        ):
-            asked = (first[those] - begin, quality[those], most)
-            worths[those] = worth(look.view, known.anchors, known.panoramas, *asked)
-        return votes, worths
+        def worths(
+            seen: View, first: NDArray[np.int64], quality: NDArray[np.float64]
+        ) -> NDArray[np.float64]:
+            found = np.empty(len(first))
+            of_crowd = first >= _FIRST_DISTRACTOR
+            for known, those, begin in (
+                (self._crowd, of_crowd, _FIRST_DISTRACTOR),
+                (self._asked.seen, ~of_crowd, 0),
+            ):
+                asked = (first[those] - begin, quality[those], most)
+                found[those] = worth(seen, known.anchors, known.panoramas, *asked)
+            return found
+
+        return candidates(description, self._database, self._asked.settings, most, worths)
 
 
 class _Round:

@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 
 from ._jit import kernel
 from .anchors import AnchorPoints, AnchorStack
-from .database import Votes
+from .database import _LEAST_QUALITY, Votes
 
 __all__ = ["DIRECTIONS", "View", "panorama", "reordered", "view", "worth"]
 
@@ -70,7 +70,6 @@ _TOLERANCE, _TOLERANCE_SHARE = 0.07, 0.015
 # Agreement is counted in whole readings; the bound is to err on the safe side.
 _SLACK = 1e-3
 _PER_PAIR, _PER_VOTE = 0.05, 0.2
-_LEAST_QUALITY = 1e-6
 _NO_AGREEMENT = -2.0
 _QUARTERS = ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))
 

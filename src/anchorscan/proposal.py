@@ -360,7 +360,7 @@ def checked(
         tiles: The map.
         settings: How many readings and proposals.
     """
-    units = np.mod(np.round(poses[:, 2] * (_TURN / (2.0 * math.pi))), _TURN)
+    units = _units(poses[:, 2]).view(np.uint16)
     return _passing(np.column_stack((poses[:, :2], units)), len(poses), points, tiles, settings)
 
 

@@ -19,12 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ._jit import kernel
+from .database import WORDS
 from .panorama import _DISTANCES, _UNITS
 
-__all__ = ["WORDS", "spacings"]
-
-WORDS = 3
-"""Integers of 64 bits that hold the spacings of a scan."""
+__all__ = ["spacings"]
 
 # Walls lie in bins of so many metres, from -12.8 m to 12.8 m; a spacing is of two bins.
 _BIN = 0.1
@@ -51,6 +49,7 @@ def spacings(panoramas: NDArray[np.uint8]) -> NDArray[np.uint64]:
         (N, 3) uint64: of walls across x that face the same way and each other (32 bits each, low
         half first), the same of walls across y, and those that turn their backs, x and y.
     """
+    # Handed over: a compiled kernel does not notice that arrays of another file have changed.
     found: NDArray[np.uint64] = _spacings(panoramas, (_DISTANCES, _UNITS))
     return found
 

@@ -129,7 +129,6 @@ def _cells_around(poses, reach):  # type: ignore[no-untyped-def]
     cells = np.empty((slots, 2), np.int64)
     nearest = np.full(slots, -1)
     far = np.empty(slots)
-    found = 0
     for n in range(len(poses)):
         x, y = poses[n, 0], poses[n, 1]
         for v in range(int(math.floor(y)) - wide, int(math.floor(y)) + wide + 2):
@@ -141,18 +140,10 @@ def _cells_around(poses, reach):  # type: ignore[no-untyped-def]
                 while nearest[slot] >= 0 and (cells[slot, 0] != u or cells[slot, 1] != v):
                     slot = (slot + 1) & (slots - 1)
                 if nearest[slot] < 0 or away < far[slot]:
-                    found += nearest[slot] < 0
                     cells[slot, 0], cells[slot, 1] = u, v
                     nearest[slot], far[slot] = n, away
-    kept = np.empty((found, 2), np.int64)
-    pose = np.empty(found, np.int64)
-    found = 0
-    for slot in range(slots):
-        if nearest[slot] >= 0:
-            kept[found, 0], kept[found, 1] = cells[slot, 0], cells[slot, 1]
-            pose[found] = nearest[slot]
-            found += 1
-    return kept, pose
+    taken = np.flatnonzero(nearest >= 0)
+    return cells[taken], nearest[taken]
 
 
 @kernel

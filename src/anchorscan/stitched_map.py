@@ -22,13 +22,13 @@ from numpy.typing import NDArray
 from .anchors import AnchorStack, stack_anchors
 from .database import RelationshipDatabase, Votes, quality
 from .decision import Decision, covariance, decide
-from .description import Description, Look, describe, looks
+from .description import Description, describe, looks
 from .evaluation import evaluate_outlines
 from .field import FieldArrays, LikelihoodField, Tiles
 from .graph import anchor_graph
 from .hypothesis import Hypothesis
 from .pairwise import Known
-from .panorama import reordered, worth
+from .panorama import View, reordered, worth
 from .placed import Lot, lot_of, nearest, tidied
 from .pose import Pose2D
 from .proposal import (
@@ -47,7 +47,7 @@ from .spacing import spacings
 from .standing import Places, places, standing
 from .verification import Fits, follow, on_large, readings, settled, verify
 
-__all__ = ["MapSearch", "StitchedMap"]
+__all__ = ["MapSearch", "StitchedMap", "candidates"]
 
 # What is known of so many references, some fifty megabytes, is kept; of others it is made again.
 _REMEMBERED = 4096
@@ -115,14 +115,9 @@ class _Content:
     @cached_property
     def places(self) -> Places:
         """Where a scan without anchor points may stand; of very many references around some."""
-        there = [lot.is_there for lot in self.lots]
-        poses, walls = (
-            np.concatenate([each[here] for each, here in zip(arrays, there, strict=True)])
-            for arrays in (
-                [lot.poses for lot in self.lots],
-                [lot.anchors.main_angles for lot in self.lots],
-            )
-        )
+        there = [(lot, np.flatnonzero(lot.is_there)) for lot in self.lots]
+        poses = np.concatenate([lot.poses[at] for lot, at in there])
+        walls = np.concatenate([lot.anchors.main_angles[at] for lot, at in there])
         step = -(-len(poses) // _MOST_STANDING) or 1
         return places(poses[::step], walls[::step], self.tiles)
 
@@ -398,23 +393,19 @@ class StitchedMap:
 
     def _candidates(self, description: Description, most: int, content: _Content) -> Votes:
         """Choose by votes, and among the first of these by what they saw."""
-        seen = looks(description, self._settings)
-        return reordered([self._compared(look, most, content) for look in seen], most)
 
-    def _compared(
-        self, look: Look, most: int, content: _Content
-    ) -> tuple[Votes, NDArray[np.float64]]:
-        """Votes, and what the first of these are worth."""
-        compared = self._settings.database.compared
-        votes = self._voting().votes(look.graph, max(most, compared), look.spacings)
-        first = votes.references[:compared]
-        worths = np.full(len(first), -np.inf)  # of those removed in between
-        for lot in content.lots:
-            places = lot.find_all(first)
-            at = np.flatnonzero(places >= 0)
-            found = (places[at], votes.quality[at], most)
-            worths[at] = worth(look.view, lot.anchors, lot.panoramas, *found)
-        return votes, worths
+        def worths(
+            seen: View, first: NDArray[np.int64], quality: NDArray[np.float64]
+        ) -> NDArray[np.float64]:
+            found = np.full(len(first), -np.inf)  # of those removed in between
+            for lot in content.lots:
+                places = lot.find_all(first)
+                at = np.flatnonzero(places >= 0)
+                asked = (places[at], quality[at], most)
+                found[at] = worth(seen, lot.anchors, lot.panoramas, *asked)
+            return found
+
+        return candidates(description, self._voting(), self._settings, most, worths)
 
     def _some(self, identifiers: NDArray[np.int64], content: _Content) -> Landmarks:
         """Join the relations of single references, less any removed in between."""
@@ -448,6 +439,32 @@ class StitchedMap:
         if len(self._memory) < _REMEMBERED:
             self._memory[len(self._memory)] = known
         return known
+
+
+def candidates(
+    description: Description,
+    database: RelationshipDatabase,
+    settings: Settings,
+    most: int,
+    worths: Callable[[View, NDArray[np.int64], NDArray[np.float64]], NDArray[np.float64]],
+) -> Votes:
+    """Choose references by votes, and among the first of these by what they saw.
+
+    Args:
+        description: Of the scan.
+        database: Of the references.
+        settings: Of all stages.
+        most: How many are wanted.
+        worths: Says what references are worth (``panorama.worth``), by their identifiers and
+            q_m, to a view of the scan.
+    """
+    compared = settings.database.compared
+    found = []
+    for look in looks(description, settings):
+        votes = database.votes(look.graph, max(most, compared), look.spacings)
+        first = (votes.references[:compared], votes.quality[:compared])
+        found.append((votes, worths(look.view, *first)))
+    return reordered(found, most)
 
 
 class _Passed(Iterator[Value]):
