@@ -37,6 +37,9 @@ class Pose2D:
     theta: float = 0.0
 
     def __post_init__(self) -> None:
+        is_plain = type(self.x) is type(self.y) is type(self.theta) is float
+        if is_plain and -math.pi < self.theta <= math.pi:
+            return
         object.__setattr__(self, "x", float(self.x))
         object.__setattr__(self, "y", float(self.y))
         theta = float(self.theta)
