@@ -9,8 +9,9 @@ import numpy as np
 from hypothesis import strategies as st
 
 from anchorscan import LaserScan, Pose2D, SensorModel, World, random_building, simulate
-from anchorscan.field import FieldSettings, LikelihoodField, Tiles
+from anchorscan.field import FieldSettings, LikelihoodField
 from anchorscan.simulator import random_poses
+from anchorscan.tiles import Tiles
 
 FULL_TURN = SensorModel(field_of_view=2.0 * math.pi, resolution=math.radians(0.5))
 WIDE = SensorModel(field_of_view=math.radians(270.0), resolution=math.radians(0.5))

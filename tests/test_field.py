@@ -23,19 +23,12 @@ from anchorscan import (
     simulate,
 )
 from anchorscan import field as field_module
-from anchorscan.field import (
-    FieldSettings,
-    LikelihoodField,
-    cell_code,
-    coarse_score,
-    field_scores,
-    normal_equations,
-    passed_through,
-    put_hessian,
-    refined,
-    room_for,
-)
-from anchorscan.field import _solved as solved
+from anchorscan.field import FieldSettings, LikelihoodField
+from anchorscan.rays import passed_through
+from anchorscan.refinement import _solved as solved
+from anchorscan.refinement import normal_equations, put_hessian, refined
+from anchorscan.score import field_scores
+from anchorscan.tiles import cell_code, coarse_score, room_for
 
 FAR, FREE, SURFACE = 63, 64, 128
 DEFAULT = Settings.preset("default").field

@@ -24,7 +24,7 @@ from scans import (
 
 from anchorscan import Pose2D, Settings, simulate
 from anchorscan.anchors import AnchorKind, AnchorPoints, anchor_points
-from anchorscan.field import LikelihoodField, coarse_score
+from anchorscan.field import LikelihoodField
 from anchorscan.proposal import ProposalSettings, joined, landmarks, proposals
 from anchorscan.proposal import _edge_proposals as edge_proposals
 from anchorscan.proposal import _first_check as first_check
@@ -32,6 +32,7 @@ from anchorscan.proposal import _highest as highest
 from anchorscan.proposal import _is_new as is_new
 from anchorscan.proposal import _lone_proposals as lone_proposals
 from anchorscan.proposal import _rotated as rotated
+from anchorscan.tiles import coarse_score
 
 LEFT, RIGHT, CONVEX, CONCAVE, VIRTUAL = AnchorKind
 DEFAULT = Settings.preset("default")

@@ -28,7 +28,11 @@ ORDER = (
     *("length_relation", "oriented_relation", "database", "panorama", "spacing", "alignment"),
     *(
         "evidence",
+        "tiles",
+        "score",
         "field",
+        "refinement",
+        "rays",
         "proposal",
         "standing",
         "verification",

@@ -13,16 +13,13 @@ from scans import FULL_TURN, WIDE, building, seeds, small_room
 
 from anchorscan import Pose2D, Settings, simulate
 from anchorscan.angle_function import AngleFunctionSettings, angle_function
-from anchorscan.field import (
-    LikelihoodField,
-    cell_code,
-    field_scores,
-    passed_through,
-    refined,
-    room_for,
-)
+from anchorscan.field import LikelihoodField
 from anchorscan.proposal import spread
+from anchorscan.rays import passed_through
+from anchorscan.refinement import refined
+from anchorscan.score import field_scores
 from anchorscan.segments import is_small
+from anchorscan.tiles import cell_code, room_for
 from anchorscan.verification import (
     FEATURES,
     Fits,

@@ -73,8 +73,9 @@ from pydantic import BaseModel, ConfigDict, Field
 from ._jit import kernel
 from .angle_function import wrapped
 from .covariance import inverses
-from .field import FieldSettings, Weights
+from .field import FieldSettings
 from .motion import Motion, MotionSettings
+from .score import Weights
 from .verification import FEATURES, LARGEST_SCORE, Fits
 
 __all__ = [

@@ -22,13 +22,15 @@ from .database import RelationshipDatabase, Votes
 from .description import Description, describe
 from .errors import AnchorscanError
 from .evaluation import Evaluation
-from .field import LikelihoodField, Tiles, Weights, field_scores
+from .field import LikelihoodField
 from .graph import AnchorGraph, stack
 from .hypothesis import Hypothesis
 from .matcher import Trace
 from .pose import Pose2D
 from .reference import Reference
 from .scan import LaserScan
+from .score import Weights, field_scores
+from .tiles import Tiles
 
 __all__ = [
     "Comparison",

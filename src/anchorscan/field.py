@@ -10,18 +10,11 @@ looked says nothing; a ray that passes through a known surface speaks against it
 The map is kept in tiles of 64 x 64 cells, which exist only where a ray told something: on its
 way, and within ``reach`` of its end.  A tile has evidence in integers (``evidence``), so that
 adding and removing a reference are exact opposites and the order of references is irrelevant,
-and one byte a cell derived from it:
+and one byte a cell derived from it, which says how far the nearest surface is, whether the cell is
+known free space, and whether it is a surface itself (``tiles``).
 
-    bits 0-5   distance to the nearest surface in 63rds of ``reach``; 63 is farther
-    bit 6      rays passed here: known free space
-    bit 7      a surface: it was hit, and hit about as often as passed
-
-A coarse copy (cells four times as wide) holds the best score of its cells, so that a pose
-that is a few decimetres off can be told from a wrong one with a handful of look-ups.
-
-Tiles are found through a table of squares, in pages of 64 x 64 squares.  Whoever reads keeps the
-map that was there when reading began: a change writes new versions of the tiles and pages that
-it touches, and no others, so that its price does not grow with the map.
+Whoever reads keeps the map that was there when reading began: a change writes new versions of the
+tiles and pages that it touches, and no others, so that its price does not grow with the map.
 
 Bytes are derived when the map is next read: what several changes have touched is derived once.
 When very much has been touched, the change itself derives it, so that no reader waits for long.
@@ -38,25 +31,21 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
-from ._jit import inlined, kernel
+from ._jit import kernel
 from .errors import AnchorscanError
 from .evidence import SIDE as _SIDE
 from .evidence import TileEvidence
 from .pose import Pose2D
 from .scan import LaserScan
+from .score import Weights
+from .tiles import FAR, FREE, SURFACE, Tiles
 
-__all__ = ["FieldArrays", "FieldSettings", "LikelihoodField", "Tiles"]
+__all__ = ["FieldArrays", "FieldSettings", "LikelihoodField"]
 
 _BLOCK = 8  # cells of the blocks of a tile that are derived anew
 _BLOCKS = _SIDE // _BLOCK
 _ALL_BLOCKS = (1 << _BLOCKS * _BLOCKS) - 1
 _COARSE = 4  # cells of a coarse cell
-_FAR = 63  # distance code of "farther than reach"
-_FREE, _SURFACE = 64, 128
-# Farther than this from all surfaces, metres, a ray is clear of them.
-_CLEAR = 0.2
-# From centre to corner in both of two cells, and some rounding, in cells.
-_CORNERS = 1.415
 _PAGE = 64  # squares along a side of a page of the table
 # So many pages cover fifty kilometres times fifty with cells of 5 cm.
 _MOST_PAGES = 1 << 16
@@ -70,29 +59,9 @@ _MANY_RAYS = 1 << 14
 # Scans that lie so many squares apart are not deposited at once.
 _WIDEST = 256
 _CENTRES = np.arange(_BLOCK, dtype=np.float32) + np.float32(0.5)
-# A ray is followed no farther, metres: a reading may claim any length.
-_LONGEST_RAY = 100.0
 # Hit positions are summed in 256ths of a cell, so that sums stay integers.
 _FRACTIONS = 256
-_CODE = np.uint8(_FAR)
-_1, _4, _6, _8, _12 = (np.uint64(value) for value in (1, 4, 6, 8, 12))
-_15, _63, _64 = (np.uint64(value) for value in (15, 63, 64))
-
-
-class Weights(NamedTuple):
-    """What readings are worth by the byte of the cell in which they end.
-
-    Args:
-        scores: (256,) float32, one at most.
-        is_new: (256,) whether a small thing there would be new.
-        share: A reading on a new thing counts as this share of one.
-        price: What new things leave unexplained counts as so many times as much.
-    """
-
-    scores: NDArray[np.float32]
-    is_new: NDArray[np.bool_]
-    share: float
-    price: float
+_1 = np.uint64(1)
 
 
 class FieldSettings(BaseModel):
@@ -128,43 +97,13 @@ class FieldSettings(BaseModel):
     def weights(self) -> Weights:
         """What a reading is worth, and which may be of new things: see ``field_scores``."""
         code = np.arange(256)
-        distance = (code & _FAR) * self.reach / _FAR
+        distance = (code & FAR) * self.reach / FAR
         score = np.maximum(self.unknown_score, 1.0 - distance / self.sharpness)
         near, far = 0.5 * self.sharpness, 0.75 * self.sharpness
         fall = np.interp(distance, (near, far), (0.5, -self.free_penalty))
-        is_free = ((code & _FREE) > 0) & (distance > near)
+        is_free = ((code & FREE) > 0) & (distance > near)
         scores = np.where(is_free, fall, score).astype(np.float32)
         return Weights(scores, is_free, self.new_share, self.new_price)
-
-
-class Tiles(NamedTuple):
-    """What kernels read of the map.
-
-    Args:
-        pages: (height * width,) int32, which page of the table covers each block of 64 x 64
-            squares; page 0 has no tiles.
-        table: (P * 4096,) int32, which tile covers each square; 0 is the empty one, and the
-            squares along the border have no other.
-        codes: (T * 4096,) uint8, a byte a cell; tile 0 is all unknown.
-        coarse: (T * 256,) int8, best score in each coarse cell, 127ths.
-        width: Pages in a row.
-        height: Rows of pages.
-        column: Cell column of the left border in the set's frame.
-        row: Cell row of the lower border.
-        resolution: Width of a cell, metres.
-        reach: Distance that the codes tell, metres.
-    """
-
-    pages: NDArray[np.int32]
-    table: NDArray[np.int32]
-    codes: NDArray[np.uint8]
-    coarse: NDArray[np.int8]
-    width: int
-    height: int
-    column: int
-    row: int
-    resolution: float
-    reach: float
 
 
 class FieldArrays(NamedTuple):
@@ -203,7 +142,7 @@ class LikelihoodField:
     def __init__(
         self, settings: FieldSettings, scans: Iterable[tuple[LaserScan, Pose2D]] = ()
     ) -> None:
-        unknown = np.full((1, _SIDE * _SIDE), _FAR, np.uint8)
+        unknown = np.full((1, _SIDE * _SIDE), FAR, np.uint8)
         coarse = np.zeros((1, (_SIDE // _COARSE) ** 2), np.int8)
         everything = np.full((1, 2), _ALL_BLOCKS, np.uint64)
         _pool(np.zeros(1, np.int32), everything, unknown, coarse, settings.weights().scores)
@@ -297,7 +236,7 @@ class LikelihoodField:
         squares, numbers = squares[order], numbers[order]
         # What was removed leaves tiles that tell nothing.
         evidence, starts = self._evidence.packed(squares)
-        told = np.array([np.any(self._codes[number] != _FAR) for number in numbers], np.bool_)
+        told = np.array([np.any(self._codes[number] != FAR) for number in numbers], np.bool_)
         told |= np.diff(starts) > 0
         numbers = np.concatenate([[0], numbers[told]]).astype(np.int64)
         return FieldArrays(
@@ -657,15 +596,15 @@ def _derive(tiles, around, dirty, layers, codes, limits):  # type: ignore[no-unt
             for j in range(_BLOCK):
                 for i in range(_BLOCK):
                     v, u = first_v + j, first_u + i
-                    code = int(codes[tiles[n], v * _SIDE + u]) & _FAR
+                    code = int(codes[tiles[n], v * _SIDE + u]) & FAR
                     if is_hit:
                         far = math.sqrt(squares[j, i]) * resolution / reach
-                        code = int(min(far, 1.0) * _FAR)
+                        code = int(min(far, 1.0) * FAR)
                     passes, hits = layers.passes[own, v, u], layers.hits[own, v, u]
                     if passes >= fewest_passes:
-                        code += _FREE
+                        code += FREE
                     if hits > 0 and passes <= passes_per_hit * hits:
-                        code += _SURFACE
+                        code += SURFACE
                     codes[tiles[n], v * _SIDE + u] = code
 
 
@@ -685,321 +624,3 @@ def _pool(tiles, dirty, codes, coarse, scores):  # type: ignore[no-untyped-def]
                         at = (j * _COARSE + b) * _SIDE + i * _COARSE + a
                         best = max(best, scores[codes[tiles[n], at]])
                 coarse[tiles[n], j * side + i] = int(round(127.0 * best))
-
-
-@kernel
-def _tile_at(tiles, u, v):  # type: ignore[no-untyped-def]
-    """Tile that covers a square, counted from the border."""
-    page = np.uint64(tiles.pages[(v >> _6) * np.uint64(tiles.width) + (u >> _6)])
-    return np.uint64(tiles.table[(page << _12) | ((v & _63) << _6) | (u & _63)])
-
-
-@kernel
-def cell_code(tiles, cx, cy):  # type: ignore[no-untyped-def]
-    """Byte of a cell of the table; the table's border is empty, so beyond it is unknown."""
-    # Unsigned indices spare the check for negative ones, which costs more than the look-up.
-    u = np.uint64(min(max(cx, 0), (tiles.width << 12) - 1))
-    v = np.uint64(min(max(cy, 0), (tiles.height << 12) - 1))
-    tile = _tile_at(tiles, u >> _6, v >> _6)
-    return tiles.codes[(tile << _12) | ((v & _63) << _6) | (u & _63)]
-
-
-@kernel
-def is_clear(x, y, tiles, distance):  # type: ignore[no-untyped-def]
-    """Whether a position is known free space, so far from all surfaces."""
-    cx = int(math.floor(x / tiles.resolution)) - tiles.column
-    cy = int(math.floor(y / tiles.resolution)) - tiles.row
-    code = cell_code(tiles, cx, cy)
-    return code & _FREE != 0 and (code & _FAR) * tiles.reach >= distance * _FAR
-
-
-@kernel
-def coarse_score(tiles, cx, cy):  # type: ignore[no-untyped-def]
-    """Best score (127ths) in a coarse cell of the table; 0 beyond its border."""
-    u = np.uint64(min(max(cx, 0), (tiles.width << 10) - 1))
-    v = np.uint64(min(max(cy, 0), (tiles.height << 10) - 1))
-    tile = _tile_at(tiles, u >> _4, v >> _4)
-    return int(tiles.coarse[(tile << _8) | ((v & _15) << _4) | (u & _15)])
-
-
-@kernel
-def room_for(readings):  # type: ignore[no-untyped-def]
-    """Columns of (N, 2) or more readings, and room to look all of them up at once."""
-    count = len(readings)
-    across, up = readings[:, 0].copy(), readings[:, 1].copy()
-    places = np.empty((3, count), np.int32)
-    return across, up, places, np.empty((4, count), np.uint8), np.empty((8, count))
-
-
-@inlined
-def _placed(cx, cy, tiles, places, i):  # type: ignore[no-untyped-def]
-    """Note where to look a cell up: its page, its square there and its place in that one's tile."""
-    # In 32 bits throughout: a processor has no instruction that does several of 64 bits.
-    u = min(max(cx, np.int32(0)), np.int32((tiles.width << 12) - 1))
-    v = min(max(cy, np.int32(0)), np.int32((tiles.height << 12) - 1))
-    places[0, i] = (v >> 12) * np.int32(tiles.width) + (u >> 12)
-    places[1, i] = ((v >> 6) & 63) << 6 | ((u >> 6) & 63)
-    places[2, i] = (v & 63) << 6 | (u & 63)
-
-
-@inlined
-def _index(tiles, places, i):  # type: ignore[no-untyped-def]
-    """Index of the code of a cell of which ``_placed`` has noted where to look."""
-    page = np.uint64(tiles.pages[np.uint64(places[0, i])])
-    tile = np.uint64(tiles.table[(page << _12) | np.uint64(places[1, i])])
-    return (tile << _12) | np.uint64(places[2, i])
-
-
-@inlined
-def look_up(pose, room, tiles):  # type: ignore[no-untyped-def]
-    """Note the bytes of the cells in which readings end at a pose; return these notes.
-
-    Two loops, since a processor does several readings at once in the first.
-    """
-    across, up, places, notes, _ = room
-    scale = 1.0 / tiles.resolution
-    c, s = math.cos(pose[2]) * scale, math.sin(pose[2]) * scale
-    x = pose[0] * scale - tiles.column
-    y = pose[1] * scale - tiles.row
-    for i in range(len(across)):
-        cx = np.int32(x + c * across[i] - s * up[i])
-        cy = np.int32(y + s * across[i] + c * up[i])
-        _placed(cx, cy, tiles, places, i)
-    codes = notes[0]
-    for i in range(len(across)):
-        codes[i] = tiles.codes[_index(tiles, places, i)]
-    return codes
-
-
-@kernel
-def field_scores(poses, readings, tiles, weights):  # type: ignore[no-untyped-def]
-    """(P,) score of readings (scan frame) at each of (P, 3) poses.
-
-    Readings are (N, 3): x, y and 1 for those on small things.
-    """
-    scores = np.empty(len(poses))
-    room = room_for(readings)
-    small = np.flatnonzero(readings[:, 2] > 0.0)
-    for p in range(len(poses)):
-        scores[p] = score_of(look_up(poses[p], room, tiles), small, weights)
-    return scores
-
-
-@inlined
-def score_of(codes, small, weights):  # type: ignore[no-untyped-def]
-    """Score of readings that end in cells of such codes; ``small`` ones are on small things."""
-    total, held_against, new = 0.0, 0.0, 0
-    for code in codes:
-        total += weights.scores[code]
-    for i in small:
-        if weights.is_new[codes[i]]:
-            held_against += weights.scores[codes[i]]
-            new += 1
-    return better_score(total, len(codes), held_against, new, weights)
-
-
-@kernel
-def better_score(total, count, held_against, new, weights):  # type: ignore[no-untyped-def]
-    """Mean score of readings, in the world as it was or in one with new things.
-
-    A small thing in known free space, as a person is, may be new, and then its readings are not
-    held against the pose: they score nothing and count less.  But that explains more at any
-    pose, so that what it leaves unexplained has a price.
-
-    ``total`` is the sum of the scores of all ``count`` readings, ``held_against`` of the ``new``.
-    """
-    if count == 0:
-        return 0.0
-    as_it_was = total / count
-    if new == 0:
-        return as_it_was
-    with_new = (total - held_against) / (count - (1.0 - weights.share) * new)
-    return max(as_it_was, 1.0 - weights.price * (1.0 - with_new))
-
-
-@inlined
-def _corners(pose, room, tiles):  # type: ignore[no-untyped-def]
-    """For each reading the arm from the pose, the place in a square of four cells, their codes.
-
-    Two loops, as in ``look_up``.
-    """
-    across, up, places, codes, numbers = room
-    c, s = math.cos(pose[2]), math.sin(pose[2])
-    for i in range(len(across)):
-        rx, ry = c * across[i] - s * up[i], s * across[i] + c * up[i]
-        gx = (pose[0] + rx) / tiles.resolution - tiles.column - 0.5
-        gy = (pose[1] + ry) / tiles.resolution - tiles.row - 0.5
-        cx, cy = np.int32(gx), np.int32(gy)
-        numbers[0, i], numbers[1, i] = rx, ry
-        numbers[2, i], numbers[3, i] = gx - cx, gy - cy
-        _placed(cx, cy, tiles, places, i)
-    for i in range(len(across)):
-        at = _index(tiles, places, i)
-        place = places[2, i]
-        codes[0, i] = tiles.codes[at]
-        if place & 63 != 63 and place >> 6 != 63:
-            # All four cells lie in one tile, as they do for 97 readings of 100.
-            codes[1, i] = tiles.codes[at + _1]
-            codes[2, i] = tiles.codes[at + _64]
-            codes[3, i] = tiles.codes[at + _64 + _1]
-        else:
-            v, u = place >> 6, place & 63
-            v += (places[0, i] // tiles.width << 12) + (places[1, i] >> 6 << 6)
-            u += (places[0, i] % tiles.width << 12) + ((places[1, i] & 63) << 6)
-            codes[1, i] = cell_code(tiles, u + 1, v)
-            codes[2, i] = cell_code(tiles, u, v + 1)
-            codes[3, i] = cell_code(tiles, u + 1, v + 1)
-
-
-@inlined
-def _gradients(room, tiles, scale):  # type: ignore[no-untyped-def]
-    """Distance to the nearest surface and its gradient at each reading, and its weight.
-
-    Bilinear, in metres; the gradient is by x, y and the turn of the pose.  The weights are those
-    of Geman and McClure, and zero where no surface is near.
-    """
-    _, _, _, codes, numbers = room
-    unit = tiles.reach / _FAR
-    for i in range(len(codes[0])):
-        fx, fy = numbers[2, i], numbers[3, i]
-        a, b = (codes[0, i] & _CODE) * unit, (codes[1, i] & _CODE) * unit
-        c, d = (codes[2, i] & _CODE) * unit, (codes[3, i] & _CODE) * unit
-        value = (a * (1.0 - fx) + b * fx) * (1.0 - fy) + (c * (1.0 - fx) + d * fx) * fy
-        dx = ((b - a) * (1.0 - fy) + (d - c) * fy) / tiles.resolution
-        dy = ((c - a) * (1.0 - fx) + (d - b) * fx) / tiles.resolution
-        weight = 1.0 / (1.0 + (value / scale) ** 2)
-        numbers[4, i], numbers[5, i], numbers[6, i] = value, dx, dy
-        numbers[7, i] = weight * weight if value < 0.9 * tiles.reach else 0.0
-
-
-@kernel
-def normal_equations(pose, room, tiles, scale):  # type: ignore[no-untyped-def]
-    """Gauss-Newton terms of the robust distances of points to surfaces.
-
-    Returns the upper triangle of the Hessian, row by row, the gradient, the weighted sum of
-    squared distances and the sum of weights (Geman-McClure weights of the given scale).
-    """
-    _corners(pose, room, tiles)
-    _gradients(room, tiles, scale)
-    numbers = room[4]
-    xx, xy, xt, yy, yt, tt = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-    x, y, t = 0.0, 0.0, 0.0
-    squares, total = 0.0, 0.0
-    for i in range(numbers.shape[1]):
-        value, dx, dy, weight = numbers[4, i], numbers[5, i], numbers[6, i], numbers[7, i]
-        dt = dy * numbers[0, i] - dx * numbers[1, i]
-        x += weight * dx * value
-        y += weight * dy * value
-        t += weight * dt * value
-        xx += weight * dx * dx
-        xy += weight * dx * dy
-        xt += weight * dx * dt
-        yy += weight * dy * dy
-        yt += weight * dy * dt
-        tt += weight * dt * dt
-        squares += weight * value * value
-        total += weight
-    return (xx, xy, xt, yy, yt, tt), (x, y, t), squares, total
-
-
-@kernel
-def put_hessian(triangle, hessian):  # type: ignore[no-untyped-def]
-    """Write a Hessian of which the upper triangle is known into a (3, 3) array."""
-    xx, xy, xt, yy, yt, tt = triangle
-    hessian[0, 0], hessian[1, 1], hessian[2, 2] = xx, yy, tt
-    hessian[0, 1] = hessian[1, 0] = xy
-    hessian[0, 2] = hessian[2, 0] = xt
-    hessian[1, 2] = hessian[2, 1] = yt
-
-
-@kernel
-def _solved(h, g, damping):  # type: ignore[no-untyped-def]
-    """Solve the damped symmetric 3 x 3 system by Cramer's rule; ``h`` is its upper triangle."""
-    a, b, c, d, e, f = h
-    a, d, f = a + damping, d + damping, f + damping
-    p, q, r = d * f - e * e, c * e - b * f, b * e - c * d
-    determinant = a * p + b * q + c * r
-    x = (p * g[0] + q * g[1] + r * g[2]) / determinant
-    y = (q * g[0] + (a * f - c * c) * g[1] + (b * c - a * e) * g[2]) / determinant
-    z = (r * g[0] + (b * c - a * e) * g[1] + (a * d - b * b) * g[2]) / determinant
-    return x, y, z
-
-
-@kernel
-def descended(pose, hessian, gradient):  # type: ignore[no-untyped-def]
-    """Move a (3,) pose by one damped step of 10 cm at most; tell whether it hardly moved."""
-    x, y, theta = _solved(hessian, gradient, 1.0)
-    size = math.hypot(x, y)
-    share = 1.0 if size < 0.1 else 0.1 / size
-    pose[0] -= share * x
-    pose[1] -= share * y
-    pose[2] -= share * theta
-    return size < 0.002 and abs(theta) < 0.0005
-
-
-@kernel
-def refined(pose, room, tiles, iterations):  # type: ignore[no-untyped-def]
-    """Move a (3,) pose so that points lie on surfaces: damped Gauss-Newton, bounded steps."""
-    moved = pose.copy()
-    for step in range(iterations):
-        # From coarse to fine: wide weights first, so that the pose can still travel.
-        scale = 0.2 if 2 * step < iterations else 0.1
-        hessian, gradient, _, _ = normal_equations(moved, room, tiles, scale)
-        if descended(moved, hessian, gradient) and 2 * step >= iterations:
-            break
-    return moved
-
-
-@kernel
-def passed_through(pose, points, tiles, margin):  # type: ignore[no-untyped-def]
-    """Share of rays that pass through a known surface more than ``margin`` before their end.
-
-    A ray passes through when it is clear of all surfaces shortly before and shortly after it
-    meets one: a ray that grazes a wall touches its cells without passing through.  Where the
-    nearest surface is far, the cells before it need no look.
-    """
-    c, s = math.cos(pose[2]), math.sin(pose[2])
-    x = pose[0] / tiles.resolution - tiles.column
-    y = pose[1] / tiles.resolution - tiles.row
-    width, height = tiles.width << 12, tiles.height << 12
-    clear = int(_CLEAR / tiles.reach * _FAR)
-    shortly = math.floor(2.0 * _CLEAR / tiles.resolution)
-    skipped = _skipped(clear, tiles)
-    through = 0
-    for i in range(len(points)):
-        length = math.hypot(points[i, 0], points[i, 1])
-        dx = (c * points[i, 0] - s * points[i, 1]) / length
-        dy = (s * points[i, 0] + c * points[i, 1]) / length
-        last_clear, met = -shortly, -1.0
-        last = math.floor((min(length, _LONGEST_RAY) - margin) / tiles.resolution) - 1.0
-        k = 0.0
-        tile, tile_x, tile_y = np.uint64(0), -_SIDE, -_SIDE
-        while k <= last:
-            cx, cy = int(x + k * dx), int(y + k * dy)
-            if ((cx ^ tile_x) | (cy ^ tile_y)) >> 6 != 0:
-                # Looked up anew only in another tile: each step has to wait for the one before.
-                tile_x, tile_y = cx, cy
-                u = np.uint64(min(max(cx, 0), width - 1))
-                v = np.uint64(min(max(cy, 0), height - 1))
-                tile = _tile_at(tiles, u >> _6, v >> _6) << _12
-            code = tiles.codes[tile | np.uint64((cy & 63) << 6 | (cx & 63))]
-            if (code & _FAR) >= clear:
-                if met >= 0.0 and k - met <= shortly:
-                    through += 1
-                    break
-                k += skipped[code & _63]
-                last_clear, met = k, -1.0
-            elif code & _SURFACE and met < 0.0 and k - last_clear <= shortly:
-                met = k
-            k += 1.0
-    return through / max(len(points), 1)
-
-
-@kernel
-def _skipped(clear, tiles):  # type: ignore[no-untyped-def]
-    """Cells of a ray, by the code of the one before them, that are clear of surfaces anyway."""
-    skipped = np.zeros(_FAR + 1)
-    for code in range(clear, _FAR + 1):
-        far = (code - clear) * tiles.reach / _FAR / tiles.resolution
-        skipped[code] = max(math.floor(far - _CORNERS), 0.0)
-    return skipped

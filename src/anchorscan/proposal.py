@@ -31,9 +31,9 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from ._jit import kernel
 from .anchors import AnchorKind, AnchorPoints, AnchorStack, stack_anchors
-from .field import Tiles, coarse_score
 from .pose import Pose2D
 from .ranking import first_from
+from .tiles import Tiles, coarse_score
 
 __all__ = [
     "Landmarks",

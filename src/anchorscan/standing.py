@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ._jit import kernel
-from .field import Tiles, is_clear
 from .proposal import Proposals, ProposalSettings, checked
+from .tiles import Tiles, is_clear
 
 __all__ = ["Places", "places", "standing"]
 

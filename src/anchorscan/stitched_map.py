@@ -24,7 +24,7 @@ from .database import RelationshipDatabase, Votes, quality
 from .decision import Decision, covariance, decide
 from .description import Description, describe, looks
 from .evaluation import evaluate_outlines
-from .field import FieldArrays, LikelihoodField, Tiles
+from .field import FieldArrays, LikelihoodField
 from .graph import anchor_graph
 from .hypothesis import Hypothesis
 from .pairwise import Known
@@ -45,6 +45,7 @@ from .scan import LaserScan
 from .settings import Settings
 from .spacing import spacings
 from .standing import Places, places, standing
+from .tiles import Tiles
 from .verification import Fits, follow, on_large, readings, settled, verify
 
 __all__ = ["MapSearch", "StitchedMap", "candidates"]

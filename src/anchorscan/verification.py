@@ -17,7 +17,7 @@ often from behind a wall; where they are dense, a door that was opened since cos
 
 The paper's anchor points come from large surfaces, since these stay; so what is small may be
 new.  At every pose the score is the better one of two worlds: as it was, and with new things in
-it, for a price (see ``field.better_score``).
+it, for a price (see ``score.better_score``).
 """
 
 from __future__ import annotations
@@ -31,22 +31,13 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from ._jit import kernel
 from .angle_function import AngleFunction, wrapped
-from .field import (
-    Tiles,
-    Weights,
-    descended,
-    field_scores,
-    look_up,
-    normal_equations,
-    passed_through,
-    put_hessian,
-    refined,
-    room_for,
-    score_of,
-)
 from .proposal import spread
 from .ranking import best_first
+from .rays import passed_through
+from .refinement import descended, normal_equations, put_hessian, refined
+from .score import Weights, field_scores, score_of
 from .segments import is_small
+from .tiles import Tiles, look_up, room_for
 
 __all__ = [
     "FEATURES",
