@@ -18,6 +18,7 @@ from anchorscan.description import describe, looks
 from anchorscan.evaluation import outline
 from anchorscan.graph import anchor_graph
 from anchorscan.segments import segments
+from anchorscan.verification import readings
 
 PRESETS = {name: Settings.preset(name) for name in ("paper", "default", "thorough")}
 presets = st.sampled_from(list(PRESETS.values()))
@@ -46,6 +47,8 @@ def check_stages(scan, settings):
     same(whole.anchors, anchors)
     same(whole.graph, anchor_graph(anchors, settings.graph))
     same(whole.outline, outline(scan, angles))
+    np.testing.assert_array_equal(whole.readings, readings(angles, settings.verification))
+    np.testing.assert_array_equal(whole.points, angles.points)
     return whole
 
 
@@ -123,8 +126,8 @@ def test_the_default_takes_more_anchors_than_the_paper(real_scans):
 @given(sweeps(), presets)
 def test_anything_a_message_may_hold_has_a_description(scan, settings):
     whole = describe(scan, settings)
-    assert len(whole.angles.ranges) <= scan.is_return.sum()
-    assert np.all(whole.surfaces.last < len(whole.angles.ranges))
+    assert len(whole.readings) <= scan.is_return.sum()
+    assert np.all(whole.surfaces.last < len(whole.readings))
     assert np.all(np.isfinite(whole.graph.lengths))
 
 
@@ -133,4 +136,4 @@ def test_anything_a_message_may_hold_has_a_description(scan, settings):
 def test_a_scan_with_nothing_to_tell_is_described_as_such(name, ranges):
     whole = describe(LaserScan.from_field_of_view(ranges, math.pi), PRESETS[name])
     assert len(whole.surfaces) == len(whole.anchors) == len(whole.graph) == 0
-    assert len(whole.angles.ranges) == sum(math.isfinite(r) and r > 0.0 for r in ranges)
+    assert len(whole.readings) == sum(math.isfinite(r) and r > 0.0 for r in ranges)

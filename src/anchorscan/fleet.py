@@ -226,7 +226,7 @@ def search(
         sets: Names and sets.
         description: Of the scan, with the settings of the sets.
     """
-    if not len(description.angles.ranges):
+    if not len(description.readings):
         return
     for name, places in sets:
         fits = places.fits(description)

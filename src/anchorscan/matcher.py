@@ -168,7 +168,7 @@ class Matcher:
         """Do what ``locate`` does and return every intermediate value."""
         description = describe(scan, self.settings)
         most = self._most(candidates)
-        seen = len(description.angles.ranges) > 0
+        seen = len(description.readings) > 0
         singles = self._singles.search(description, most) if seen and self._singles else None
         in_map = self._map.search(description, most) if seen and self._map else None
         searches = [search for search in (in_map, singles) if search is not None]

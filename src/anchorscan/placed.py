@@ -191,9 +191,7 @@ def lot_of(known: Iterable[Known], first: int, settings: ProposalSettings) -> Lo
             raise ValueError(f"reference {each.reference.identifier} has no pose")
         references.append(each.reference)
         anchors.append(each.description.anchors)
-        panoramas.append(
-            panorama(each.description.angles.points, each.description.anchors.main_angle)
-        )
+        panoramas.append(panorama(each.description.points, each.description.anchors.main_angle))
         poses.append(each.reference.pose.to_array())
     identifiers = np.array([each.identifier for each in references], np.int64)
     if len(np.unique(identifiers)) < len(identifiers):

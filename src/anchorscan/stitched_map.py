@@ -46,7 +46,7 @@ from .settings import Settings
 from .spacing import spacings
 from .standing import Places, places, standing
 from .tiles import Tiles
-from .verification import Fits, follow, on_large, readings, settled, verify
+from .verification import Fits, follow, on_large, settled, verify
 
 __all__ = ["MapSearch", "StitchedMap", "candidates"]
 
@@ -327,7 +327,7 @@ class StitchedMap:
     ) -> tuple[Votes | None, Proposals, Fits]:
         """Let relations propose poses, sieve and refine them."""
         settings, tiles = self._settings, content.tiles
-        seen = readings(description.angles, settings.verification)
+        seen = description.readings
         large = on_large(seen)
         votes = None if most is None else self._candidates(description, most, content)
         related = content.landmarks if votes is None else self._some(votes.references, content)
