@@ -143,7 +143,7 @@ def plain_unified(centre, pairs, graph, reference, s):
 
 def check_against_twin(graph, references, s=SETTINGS):
     result = align(graph, stack(references), s)
-    pairs = result.correspondences
+    pairs = result.steps.correspondences
     for c, reference in enumerate(references):
         expected = plain_pairs(graph, reference, s.length_tolerance)
         begin, end = pairs.starts[c : c + 2]
@@ -158,39 +158,39 @@ def check_against_twin(graph, references, s=SETTINGS):
             [(e, f, t) for (e, f, _), t in zip(expected, pairs.turns[begin:end], strict=True)],
             s.histogram_bins,
         )
-        assert result.histograms[c].tolist() == histogram
+        assert result.steps.histograms[c].tolist() == histogram
         peaks = plain_peaks(histogram, s.histogram_peaks, s.turn_tolerance)
-        found = result.peaks[c][~np.isnan(result.peaks[c])]
+        found = result.steps.peaks[c][~np.isnan(result.steps.peaks[c])]
         np.testing.assert_allclose(found, peaks, atol=1e-9)
         for p, peak in enumerate(found):
             branch = c * s.histogram_peaks + p
             turns = pairs.turns[begin:end]
             off = np.abs(turns - peak)
             near = np.flatnonzero(np.minimum(off, math.pi - off) <= s.turn_tolerance)
-            kept = result.kept[slice(*result.kept_starts[branch : branch + 2])] - begin
+            kept = result.steps.kept[slice(*result.steps.kept_starts[branch : branch + 2])] - begin
             assert kept.tolist() == near.tolist()
             left = [expected[k] for k in near]
             matrix = plain_matrix(left, graph, reference)
-            np.testing.assert_array_equal(result.matrix(branch), matrix)
+            np.testing.assert_array_equal(result.steps.matrix(branch), matrix)
             groups = range(branch * s.matrix_peaks, (branch + 1) * s.matrix_peaks)
             values = sorted(matrix.ravel(), reverse=True)[: s.matrix_peaks]
-            assert [result.maxima[g, 2] for g in groups][: len(values)] == values
+            assert [result.steps.maxima[g, 2] for g in groups][: len(values)] == values
             for g in groups:
                 check_group(result, g, left, graph, reference, s)
 
 
 def check_group(result, g, pairs, graph, reference, s):
-    row, column, value = result.maxima[g].tolist()
+    row, column, value = result.steps.maxima[g].tolist()
     if value == 0:
         return
     hypotheses = plain_contributions(pairs, graph, reference, row, column)
-    got = result.contributions[slice(*result.contribution_starts[g : g + 2])]
+    got = result.steps.contributions[slice(*result.steps.contribution_starts[g : g + 2])]
     assert len(hypotheses) == value == len(got)
     for pose, (x, y, theta) in zip(hypotheses, got, strict=True):
         assert (pose.x, pose.y) == pytest.approx((x, y), abs=1e-9)
         assert wrap_angle(pose.theta - theta) == pytest.approx(0.0, abs=1e-9)
     centre, size = plain_cluster([Pose2D(*p) for p in got], s)
-    inside = result.in_cluster[slice(*result.contribution_starts[g : g + 2])]
+    inside = result.steps.in_cluster[slice(*result.steps.contribution_starts[g : g + 2])]
     assert inside.sum() == size
     mean, support = plain_unified(centre, pairs, graph, reference, s)
     c = g // (s.histogram_peaks * s.matrix_peaks)
@@ -271,8 +271,8 @@ def test_a_subgraph_is_found_and_an_accidental_correspondence_is_ruled_out():
 
     assert Pose2D(*result.poses[0]).distance(motion) < 1e-6
     assert Pose2D(*result.poses[0]).turn(motion) < 1e-6
-    assert len(result.kept) < len(correspondences(small, stack([large]), 0.1))
-    assert np.degrees(result.peaks[0, 0]) == pytest.approx(30.0, abs=2.0)
+    assert len(result.steps.kept) < len(correspondences(small, stack([large]), 0.1))
+    assert np.degrees(result.steps.peaks[0, 0]) == pytest.approx(30.0, abs=2.0)
 
 
 @settings(deadline=None, max_examples=30)
@@ -288,10 +288,10 @@ def test_one_maximum_gives_the_centre_of_gravity_of_the_twin(seed):
     pairs = [
         (e, f, turn)
         for e, f, turn in plain_pairs(graph, reference, s.length_tolerance)
-        if (off := abs(turn - result.peaks[0, 0])) <= s.turn_tolerance
+        if (off := abs(turn - result.steps.peaks[0, 0])) <= s.turn_tolerance
         or math.pi - off <= s.turn_tolerance
     ]
-    centre, _ = plain_cluster([Pose2D(*p) for p in result.contributions], s)
+    centre, _ = plain_cluster([Pose2D(*p) for p in result.steps.contributions], s)
     mean, support = plain_unified(centre, pairs, graph, reference, s)
 
     assert apart(Pose2D(*result.poses[0]), mean, s) < 1e-9

@@ -117,7 +117,7 @@ def test_edges_that_coincide_do_so_end_on_end(several: list[Explanation]) -> Non
         tolerance = explanation.trace.settings.alignment.cluster_distance
         laid = set(map(tuple, pairing.edges.tolist()))
         found += len(laid)
-        for theirs_edge, ours_edge in pairing.alignment.correspondences.edges.tolist():
+        for theirs_edge, ours_edge in pairing.alignment.steps.correspondences.edges.tolist():
             assert pairing.aligned is not None
             there = pairing.description.graph.anchors.positions[
                 pairing.description.graph.nodes[theirs_edge]

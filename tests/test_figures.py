@@ -126,9 +126,9 @@ def test_the_histograms_of_the_walls_hold_every_metre_of_surface(
 
 
 def test_the_matching_angles_are_all_corresponding_pairs(explanation: Explanation) -> None:
-    alignment = explanation.pairing.alignment
+    steps = explanation.pairing.alignment.steps
     axes = draw(explanation, "5-matching-angles").axes[0]
-    assert sum(bar.get_height() for bar in axes.patches) == len(alignment.correspondences)
+    assert sum(bar.get_height() for bar in axes.patches) == len(steps.correspondences)
     # The turn of the answer is drawn where its pairs are: modulo half a turn.
     (turn,) = set(axes.lines[0].get_xdata())
     expected = math.degrees(explanation.trace.hypotheses[0].pose_in_reference.theta)
@@ -139,7 +139,7 @@ def test_the_matching_angles_are_all_corresponding_pairs(explanation: Explanatio
 
 def test_the_matrix_is_that_of_the_alignment(explanation: Explanation) -> None:
     axes = draw(explanation, "6-correspondence-matrix").axes[0]
-    matrix = explanation.pairing.alignment.matrix(0)
+    matrix = explanation.pairing.alignment.steps.matrix(0)
     np.testing.assert_array_equal(axes.images[0].get_array(), matrix)
     assert explanation.pairing.maximum is not None
     row, column, value = explanation.pairing.maximum

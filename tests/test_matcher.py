@@ -222,7 +222,7 @@ def test_the_trace_holds_what_led_to_the_answer():
         r.identifier for r in trace.pairwise.candidates
     ]
     assert trace.pairwise.evaluations.max() == trace.hypotheses[0].evaluation
-    assert len(trace.pairwise.alignment.histograms) == 3
+    assert len(trace.pairwise.alignment.steps.histograms) == 3
     again = trace.evaluation(trace.hypotheses[0])
     assert again.e_m == trace.hypotheses[0].evaluation
     other = dataclasses.replace(trace.hypotheses[0], reference=77)

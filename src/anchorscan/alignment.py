@@ -30,6 +30,8 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,7 +41,14 @@ from ._jit import kernel
 from .graph import AnchorGraph, GraphStack
 from .ranking import best_first
 
-__all__ = ["Alignment", "AlignmentSettings", "Correspondences", "align", "correspondences"]
+__all__ = [
+    "Alignment",
+    "AlignmentSettings",
+    "AlignmentSteps",
+    "Correspondences",
+    "align",
+    "correspondences",
+]
 
 
 class AlignmentSettings(BaseModel):
@@ -94,7 +103,35 @@ class Correspondences:
 
 @dataclass(frozen=True, eq=False)
 class Alignment:
-    """The alignments of one graph with several candidates, and all that led to them.
+    """The alignments of one graph with several candidates.
+
+    Args:
+        candidates: (N,) candidate of every alignment; the strongest first in each candidate.
+        poses: (N, 3) ``T_reference_scan`` as x, y, theta, metres and radians.
+        support: (N,) edge correspondences that mean it.
+        scatter: (N, 3, 3) covariance of x, y, theta among their hypotheses.
+        asked: The graph, the candidates and the settings.
+    """
+
+    candidates: NDArray[np.int64]
+    poses: NDArray[np.float64]
+    support: NDArray[np.int64]
+    scatter: NDArray[np.float64]
+    asked: tuple[AnchorGraph, GraphStack, AlignmentSettings]
+
+    def __len__(self) -> int:
+        return len(self.support)
+
+    @cached_property
+    def steps(self) -> AlignmentSteps:
+        """All that led to them, derived anew for whoever looks at it."""
+        pairs, branches, hypotheses, _ = _steps(*_arguments(*self.asked))
+        return AlignmentSteps(Correspondences(*pairs), *branches, *hypotheses)
+
+
+@dataclass(frozen=True, eq=False)
+class AlignmentSteps:
+    """All that led to the alignments of one graph with several candidates.
 
     With C candidates, ``histogram_peaks`` K and ``matrix_peaks`` L there are B = C K
     branches and G = B L groups of hypotheses; group g belongs to candidate g // (K L).
@@ -112,10 +149,6 @@ class Alignment:
         contributions: (H, 3) x, y, theta of every hypothesis before clustering.
         contribution_starts: (G + 1,) where those of each group begin.
         in_cluster: (H,) whether the clustering step kept it for the centre of its group.
-        candidates: (N,) candidate of every alignment; the strongest first in each candidate.
-        poses: (N, 3) ``T_reference_scan`` as x, y, theta, metres and radians.
-        support: (N,) edge correspondences that mean it.
-        scatter: (N, 3, 3) covariance of x, y, theta among their hypotheses.
     """
 
     correspondences: Correspondences
@@ -130,13 +163,6 @@ class Alignment:
     contributions: NDArray[np.float64]
     contribution_starts: NDArray[np.int64]
     in_cluster: NDArray[np.bool_]
-    candidates: NDArray[np.int64]
-    poses: NDArray[np.float64]
-    support: NDArray[np.int64]
-    scatter: NDArray[np.float64]
-
-    def __len__(self) -> int:
-        return len(self.support)
 
     def matrix(self, branch: int) -> NDArray[np.int32]:
         """Return the (n, m) node correspondence matrix of a branch."""
@@ -160,7 +186,15 @@ def correspondences(
 
 def align(graph: AnchorGraph, references: GraphStack, settings: AlignmentSettings) -> Alignment:
     """Align a graph with every candidate reference (section 4.2)."""
-    found = _align(
+    candidates, poses, support, scatter = _aligned(*_arguments(graph, references, settings))
+    return Alignment(candidates, poses, support, scatter, (graph, references, settings))
+
+
+def _arguments(
+    graph: AnchorGraph, references: GraphStack, settings: AlignmentSettings
+) -> tuple[Any, ...]:
+    """What the kernels ask for."""
+    return (
         (graph.lengths, graph.directions, graph.nodes, graph.anchors.positions),
         (references.lengths, references.directions, references.nodes, references.positions),
         references.edge_starts,
@@ -169,8 +203,6 @@ def align(graph: AnchorGraph, references: GraphStack, settings: AlignmentSetting
         (settings.histogram_bins, settings.histogram_peaks, settings.matrix_peaks),
         (settings.cluster_distance, settings.cluster_turn),
     )
-    pairs, branches, hypotheses, alignments = found
-    return Alignment(Correspondences(*pairs), *branches, *hypotheses, *alignments)
 
 
 # Squared distance, in units of the cluster's size, that is nothing but rounding.
@@ -178,8 +210,8 @@ _ROUNDING = 1e-12
 
 
 @kernel
-def _align(graph, references, edge_starts, node_starts, tolerances, counts, size):  # type: ignore[no-untyped-def]
-    """All steps: what ``Correspondences`` and ``Alignment`` hold, in their order."""
+def _steps(graph, references, edge_starts, node_starts, tolerances, counts, size):  # type: ignore[no-untyped-def]
+    """All steps: what ``AlignmentSteps`` and ``Alignment`` hold, in their order."""
     length_tolerance, turn_tolerance = tolerances
     bins, histogram_peaks, matrix_peaks = counts
     points, positions = graph[3], references[3]
@@ -218,6 +250,12 @@ def _align(graph, references, edge_starts, node_starts, tolerances, counts, size
         (maxima, contributions, group_starts, in_cluster),
         (candidates[distinct], poses[distinct], support[distinct], scatter[distinct]),
     )
+
+
+@kernel
+def _aligned(graph, references, edge_starts, node_starts, tolerances, counts, size):  # type: ignore[no-untyped-def]
+    """What ``Alignment`` holds: each array that is handed back costs a microsecond."""
+    return _steps(graph, references, edge_starts, node_starts, tolerances, counts, size)[3]
 
 
 @kernel

@@ -113,7 +113,7 @@ class Pairing:
     @property
     def maximum(self) -> tuple[int, int, int] | None:
         """Reference's anchor, scan's anchor and count at the maximum of the matrix."""
-        maxima = self.alignment.maxima
+        maxima = self.alignment.steps.maxima
         if not len(maxima) or maxima[:, 2].max() == 0:
             return None
         row, column, value = maxima[np.argmax(maxima[:, 2])].tolist()
@@ -217,7 +217,7 @@ def _laid_on(
 ) -> NDArray[np.int64]:
     """(P, 2) corresponding edges whose ends the alignment lays no farther apart than that."""
     T_reference_scan = _aligned(alignment)
-    edges = alignment.correspondences.edges.astype(np.int64)
+    edges = alignment.steps.correspondences.edges.astype(np.int64)
     if T_reference_scan is None:
         return edges[:0]
     there = theirs.anchors.positions[theirs.nodes[edges[:, 0]]]

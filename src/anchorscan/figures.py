@@ -419,11 +419,11 @@ def _connect(
 def _draw_matching_angles(explanation: Explanation, theme: Theme) -> Figure:
     """Figure 4 of the paper: the matching angle histogram."""
     pairing, settings = explanation.pairing, explanation.trace.settings.alignment
-    alignment = pairing.alignment
-    counts = alignment.histograms[0]
+    steps = pairing.alignment.steps
+    counts = steps.histograms[0]
     width = 180.0 / len(counts)
     centres = (np.arange(len(counts)) + 0.5) * width
-    peak = math.degrees(alignment.peaks[0, 0])
+    peak = math.degrees(steps.peaks[0, 0])
     off = np.abs(centres - peak)
     chosen = np.minimum(off, 180.0 - off) <= math.degrees(settings.turn_tolerance)
     turn = math.degrees(pairing.hypothesis.pose_in_reference.theta) % 180.0
@@ -442,7 +442,7 @@ def _draw_matching_angles(explanation: Explanation, theme: Theme) -> Figure:
     axes.set_xlabel("angle between corresponding edges, modulo 180 degrees")
     axes.set_ylabel("pairs of edges")
     axes.set_title(
-        f"{len(alignment.correspondences)} pairs correspond in length, "
+        f"{len(steps.correspondences)} pairs correspond in length, "
         f"{int(counts[chosen].sum())} of them at the peak; the others are ruled out"
     )
     legend(
@@ -464,7 +464,7 @@ def _draw_matrix(explanation: Explanation, theme: Theme) -> Figure:
     if not len(pairing.description.anchors) or not len(anchors):
         nothing_to_draw(axes, "One of the two scans has no anchor point.", theme)
         return figure
-    matrix = pairing.alignment.matrix(0)
+    matrix = pairing.alignment.steps.matrix(0)
     image = axes.imshow(matrix, cmap=ramp(theme), vmin=0, interpolation="nearest", aspect="equal")
     _plot_scale(figure, axes, image, "pairs of edges")
     size = min(18.0, 260.0 / max(matrix.shape))
