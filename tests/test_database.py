@@ -84,6 +84,9 @@ def test_counts_and_quality_are_those_of_plain_counting(query, references, count
 
     assert [row[:2] for row in as_rows(votes)] == [row[:2] for row in expected]
     assert votes.quality.tolist() == pytest.approx([row[2] for row in expected])
+    for (identifier, _, q_m), lone in ((row, graphs[row[0]]) for row in as_rows(votes)):
+        alone = database.quality(graph_of(query).lengths, lone.lengths, TOLERANCE, count_once)
+        assert (identifier, alone) == (identifier, q_m)
 
 
 @given(lengths, st.lists(lengths, max_size=8), st.integers(1, 9))

@@ -14,7 +14,7 @@ from scans import FULL_TURN, WIDE, building, seeds, small_room
 from anchorscan import Pose2D, Settings, simulate
 from anchorscan.angle_function import AngleFunctionSettings, angle_function
 from anchorscan.field import LikelihoodField
-from anchorscan.proposal import spread
+from anchorscan.proposal import on_large, spread
 from anchorscan.rays import passed_through
 from anchorscan.refinement import refined
 from anchorscan.score import field_scores
@@ -24,7 +24,6 @@ from anchorscan.verification import (
     FEATURES,
     Fits,
     VerificationSettings,
-    on_large,
     readings,
     verify,
     worth,

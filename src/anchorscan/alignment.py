@@ -38,7 +38,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
 from ._jit import kernel
-from .graph import AnchorGraph, GraphStack
+from .graph import AnchorGraph, GraphStack, bearings
 from .ranking import best_first
 
 __all__ = [
@@ -195,7 +195,7 @@ def _arguments(
 ) -> tuple[Any, ...]:
     """What the kernels ask for."""
     return (
-        (graph.lengths, graph.directions, graph.nodes, graph.anchors.positions),
+        (graph.lengths, graph.nodes, graph.anchors.positions),
         (references.lengths, references.directions, references.nodes, references.positions),
         references.edge_starts,
         references.node_starts,
@@ -214,8 +214,10 @@ def _steps(graph, references, edge_starts, node_starts, tolerances, counts, size
     """All steps: what ``AlignmentSteps`` and ``Alignment`` hold, in their order."""
     length_tolerance, turn_tolerance = tolerances
     bins, histogram_peaks, matrix_peaks = counts
-    points, positions = graph[3], references[3]
-    pairs = _correspondences(references, edge_starts, graph, length_tolerance)
+    lengths, ends, points = graph
+    positions = references[3]
+    graph_with_directions = (lengths, bearings(points, ends), ends, points)
+    pairs = _correspondences(references, edge_starts, graph_with_directions, length_tolerance)
     _, all_nodes, turns, starts = pairs
     histograms = _histograms(turns, starts, bins)
     peaks = _peaks(histograms, histogram_peaks, turn_tolerance)

@@ -335,15 +335,6 @@ class RelationshipDatabase:
         self._state = _State(parts, identifiers, sizes, spacings, count, count)
 
 
-def quality(graph: AnchorGraph, other: AnchorGraph, settings: DatabaseSettings) -> float:
-    """Compute the paper's q_m of two graphs without a database (section 4.1)."""
-    pairs = float(len(graph)) * len(other)
-    if not pairs:
-        return 0.0
-    count = corresponding_lengths(graph, other, settings.length_tolerance, settings.count_once)
-    return float(count) ** 2 / pairs
-
-
 def _tidied(parts: list[Any], one_part: bool = False) -> tuple[Any, ...]:
     """Merge the last parts until each is much smaller than the one before it, or all."""
     while len(parts) > 1:
@@ -379,6 +370,13 @@ def _pairs(size, edges):  # type: ignore[no-untyped-def]
 def _quality(count, size, edges):  # type: ignore[no-untyped-def]
     """The q_m of a reference of so many edges."""
     return np.float64(count) ** 2 / _pairs(size, edges)
+
+
+@kernel
+def quality(lengths, others, tolerance, once):  # type: ignore[no-untyped-def]
+    """The q_m of two graphs without a database, by the lengths of their edges, in order."""
+    count = corresponding_lengths(lengths, others, tolerance, once)
+    return _quality(count, len(others), (len(lengths), 0))
 
 
 @kernel

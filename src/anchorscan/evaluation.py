@@ -49,7 +49,6 @@ __all__ = [
     "clearance",
     "evaluate",
     "evaluate_all",
-    "evaluate_outlines",
     "outline",
     "probability",
     "stack_outlines",
@@ -171,10 +170,13 @@ def outline(scan: LaserScan, angles: AngleFunction) -> Outline:
 
 def stack_outlines(outlines: Sequence[Outline]) -> OutlineStack:
     """Put outlines one behind the other; none at all gives an empty stack."""
+    if not outlines:
+        return OutlineStack(_NO_ROWS, np.zeros(1, np.int64), np.empty((0, 4)))
+    rows = [each.rows for each in outlines]
     return OutlineStack(
-        np.concatenate([_NO_ROWS, *(each.rows for each in outlines)]),
-        np.array([0, *accumulate(len(each.rows) for each in outlines)], np.int64),
-        np.array([each.geometry for each in outlines]).reshape(-1, 4),
+        np.concatenate(rows),
+        np.array([0, *accumulate(map(len, rows))], np.int64),
+        np.concatenate([each.geometry for each in outlines]).reshape(-1, 4),
     )
 
 
@@ -220,35 +222,14 @@ def evaluate_all(
         references.geometries,
         candidates,
         poses,
-        (settings.tolerance, settings.relative_tolerance, settings.largest_tolerance),
+        tolerances(settings),
     )
     return e_m
 
 
-def evaluate_outlines(
-    scan: Outline,
-    reference: Outline,
-    T_reference_scan: NDArray[np.float64],
-    settings: EvaluationSettings,
-) -> float:
-    """Compute e_m of one alignment (section 5).
-
-    Args:
-        scan: The scan.
-        reference: The reference.
-        T_reference_scan: (3,) x, y, theta, metres and radians.
-        settings: Of the evaluation.
-    """
-    return float(
-        _evaluation(
-            scan.rows,
-            scan.geometry,
-            reference.rows,
-            reference.geometry,
-            T_reference_scan,
-            (settings.tolerance, settings.relative_tolerance, settings.largest_tolerance),
-        )
-    )
+def tolerances(settings: EvaluationSettings) -> tuple[float, float, float]:
+    """Return the settings that kernels need: how much readings that agree may differ."""
+    return settings.tolerance, settings.relative_tolerance, settings.largest_tolerance
 
 
 def evaluate(
@@ -282,9 +263,9 @@ def evaluate(
     return Evaluation(float(e_m[0]), "scan", synthetic)
 
 
-def probability(e_m: NDArray[np.float64], settings: AcceptanceSettings) -> NDArray[np.float64]:
-    """Turn evaluations into probabilities of being right, by a logistic curve."""
-    return np.asarray(1.0 / (1.0 + np.exp(-settings.slope * (e_m - settings.even))))
+def probability(e_m: float, settings: AcceptanceSettings) -> float:
+    """Turn an evaluation into the probability of being right, by a logistic curve."""
+    return 0.5 * (1.0 + math.tanh(0.5 * settings.slope * (e_m - settings.even)))
 
 
 def synthetic_scan(
@@ -511,7 +492,7 @@ def _agreement(rows, geometry, inverse, tolerances):  # type: ignore[no-untyped-
 
 
 @kernel
-def _evaluation(rows, geometry, reference_rows, reference_geometry, pose, tolerances):  # type: ignore[no-untyped-def]
+def evaluation(rows, geometry, reference_rows, reference_geometry, pose, tolerances):  # type: ignore[no-untyped-def]
     """e_m of one alignment."""
     if _reference_has_overview(rows, geometry, reference_rows, reference_geometry, pose):
         c, s = math.cos(pose[2]), math.sin(pose[2])
@@ -531,5 +512,5 @@ def _evaluations(rows, geometry, all_rows, starts, geometries, candidates, poses
     for n in range(len(poses)):
         c = candidates[n]
         reference_rows = all_rows[starts[c] : starts[c + 1]]
-        e_m[n] = _evaluation(rows, geometry, reference_rows, geometries[c], poses[n], tolerances)
+        e_m[n] = evaluation(rows, geometry, reference_rows, geometries[c], poses[n], tolerances)
     return e_m

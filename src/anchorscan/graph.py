@@ -60,8 +60,8 @@ class AnchorGraph:
     @cached_property
     def directions(self) -> NDArray[np.float64]:
         """(E,) bearing from node a to node b, radians in (-pi, pi], scan frame."""
-        bearings: NDArray[np.float64] = _bearings(self.anchors.positions, self.nodes)
-        return bearings
+        directions: NDArray[np.float64] = bearings(self.anchors.positions, self.nodes)
+        return directions
 
     @property
     def node_a(self) -> NDArray[np.int32]:
@@ -111,19 +111,24 @@ def edge_limits(settings: GraphSettings) -> tuple[float, float]:
 
 def stack(graphs: Sequence[AnchorGraph]) -> GraphStack:
     """Put graphs one behind the other; none at all gives an empty stack."""
+    if not graphs:
+        return GraphStack(_NO_POSITIONS, _NO_NODES, _NO_VALUES, _NO_VALUES, _NO_STARTS, _NO_STARTS)
+    parts = [(g.anchors.positions, g.nodes, g.lengths, g.directions) for g in graphs]
+    positions, nodes, lengths, directions = zip(*parts, strict=True)
     return GraphStack(
-        np.concatenate([_NO_POSITIONS, *(graph.anchors.positions for graph in graphs)]),
-        np.concatenate([_NO_NODES, *(graph.nodes for graph in graphs)]),
-        np.concatenate([_NO_VALUES, *(graph.lengths for graph in graphs)]),
-        np.concatenate([_NO_VALUES, *(graph.directions for graph in graphs)]),
-        np.array([0, *accumulate(len(graph.anchors) for graph in graphs)], np.int64),
-        np.array([0, *accumulate(len(graph.lengths) for graph in graphs)], np.int64),
+        np.concatenate(positions),
+        np.concatenate(nodes),
+        np.concatenate(lengths),
+        np.concatenate(directions),
+        np.array([0, *accumulate(map(len, positions))], np.int64),
+        np.array([0, *accumulate(map(len, lengths))], np.int64),
     )
 
 
 _NO_POSITIONS = np.empty((0, 2))
 _NO_NODES = np.empty((0, 2), np.int32)
 _NO_VALUES = np.empty(0)
+_NO_STARTS = np.zeros(1, np.int64)
 
 
 @kernel
@@ -150,12 +155,12 @@ def _edges(positions, limits):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _bearings(positions, nodes):  # type: ignore[no-untyped-def]
+def bearings(positions, nodes):  # type: ignore[no-untyped-def]
     """Direction of every edge."""
-    bearings = np.empty(len(nodes))
+    directions = np.empty(len(nodes))
     for e in range(len(nodes)):
         a, b = nodes[e, 0], nodes[e, 1]
-        bearings[e] = math.atan2(
+        directions[e] = math.atan2(
             positions[b, 1] - positions[a, 1], positions[b, 0] - positions[a, 0]
         )
-    return bearings
+    return directions

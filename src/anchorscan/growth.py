@@ -52,7 +52,7 @@ from .settings import Settings
 from .simulator import SensorModel, random_building, random_poses, simulate
 from .spacing import spacings
 from .stitched_map import candidates
-from .verification import on_large, readings, verify
+from .verification import readings, verify
 
 __all__ = ["RANKS", "SIZES", "Growth", "Place", "Scene", "Size", "distractors", "measure", "slope"]
 
@@ -335,9 +335,8 @@ class _Asked:
             return False
         settings = self.settings
         seen = readings(description.angles, settings.verification)
-        large = on_large(seen)
         related = joined([self._landmarks[number] for number in some])
-        proposed = proposals(description.anchors, large, related, self._tiles, settings.proposal)
+        proposed = proposals(description.anchors, seen, related, self._tiles, settings.proposal)
         fits = verify(proposed.poses, seen, self._tiles, self._weights, settings.verification)
         if not len(fits):
             return False

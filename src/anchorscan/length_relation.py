@@ -161,13 +161,6 @@ class LengthRelation:
         return counts, cursors
 
 
-def corresponding_lengths(
-    graph: AnchorGraph, other: AnchorGraph, tolerance: float, count_once: bool
-) -> int:
-    """Count corresponding edges of two graphs: n_m without a database."""
-    return int(_count_pair(graph.lengths, other.lengths, tolerance, count_once))
-
-
 def _starts(lengths: NDArray[np.float32]) -> NDArray[np.int64]:
     """(_BINS + 1,) where each length bin begins once (E,) lengths are in order."""
     starts = np.zeros(_BINS + 1, np.int64)
@@ -236,8 +229,8 @@ def _count(query, edges, tolerance, counts, cursors):  # type: ignore[no-untyped
 
 
 @kernel
-def _count_pair(query, lengths, tolerance, once):  # type: ignore[no-untyped-def]
-    """Corresponding edges of two graphs, both in order of length."""
+def corresponding_lengths(query, lengths, tolerance, once):  # type: ignore[no-untyped-def]
+    """Count corresponding edges of two graphs, both in order of length: n_m without a database."""
     count = 0
     low = 0
     high = 0

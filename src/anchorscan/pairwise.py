@@ -186,22 +186,22 @@ def _hypotheses(
     settings: Settings,
 ) -> tuple[Hypothesis, ...]:
     """Order the evaluated alignments and say what each is worth."""
-    order = np.lexsort((found.candidates, -found.support, -e_m))[: settings.acceptance.hypotheses]
-    candidates, fits = found.candidates[order], e_m[order]
-    named = [references[candidate] for candidate in candidates.tolist()]
-    covariances = _covariances(
-        found.scatter[order],
-        np.array([_heading(reference) for reference in named]),
-        settings.alignment.position_deviation,
-        settings.alignment.heading_deviation,
+    order, covariances = _best(
+        found.candidates,
+        found.support,
+        found.scatter,
+        e_m,
+        np.array([_heading(reference) for reference in references]),
+        (settings.alignment.position_deviation, settings.alignment.heading_deviation),
+        settings.acceptance.hypotheses,
     )
     # As plain numbers at once: to take them out of arrays one by one takes several times as long.
-    poses, qualities = found.poses[order].tolist(), votes.quality[candidates].tolist()
-    worth = probability(fits, settings.acceptance).tolist()
-    threshold = settings.acceptance.threshold
+    candidates, poses, fits = found.candidates.tolist(), found.poses.tolist(), e_m.tolist()
+    qualities = votes.quality.tolist()
     hypotheses = []
-    for n, (reference, fit) in enumerate(zip(named, fits.tolist(), strict=True)):
-        T_reference_scan = Pose2D(*poses[n])
+    for n, k in enumerate(order.tolist()):
+        reference, fit = references[candidates[k]], fits[k]
+        T_reference_scan = Pose2D(*poses[k])
         hypotheses.append(
             Hypothesis(
                 reference=reference.identifier,
@@ -209,10 +209,10 @@ def _hypotheses(
                 pose=None if reference.pose is None else reference.pose @ T_reference_scan,
                 covariance=covariances[n],
                 evaluation=fit,
-                quality=qualities[n],
+                quality=qualities[candidates[k]],
                 score=fit,
-                probability=worth[n],
-                accepted=fit >= threshold,
+                probability=probability(fit, settings.acceptance),
+                accepted=fit >= settings.acceptance.threshold,
             )
         )
     return tuple(hypotheses)
@@ -223,8 +223,9 @@ def _heading(reference: Reference) -> float:
 
 
 @kernel
-def _covariances(scatter, headings, position, heading):  # type: ignore[no-untyped-def]
+def _covariances(scatter, headings, deviations):  # type: ignore[no-untyped-def]
     """Scatter with the least deviations added, turned into the frame of the set."""
+    position, heading = deviations
     covariances = np.empty((len(scatter), 3, 3))
     for n in range(len(scatter)):
         c, s = math.cos(headings[n]), math.sin(headings[n])
@@ -239,3 +240,28 @@ def _covariances(scatter, headings, position, heading):  # type: ignore[no-untyp
         out[1, 2] = out[2, 1] = s * xt + c * yt
         out[2, 2] = scatter[n, 2, 2] + heading * heading
     return covariances
+
+
+@kernel
+def _is_better(k, other, candidates, support, e_m):  # type: ignore[no-untyped-def]
+    """Whether an alignment comes before another, which stands before it."""
+    if e_m[k] != e_m[other]:
+        return e_m[k] > e_m[other]
+    if support[k] != support[other]:
+        return support[k] > support[other]
+    return candidates[k] < candidates[other]
+
+
+@kernel
+def _best(candidates, support, scatter, e_m, headings, deviations, most):  # type: ignore[no-untyped-def]
+    """Which alignments are the best, and the covariance of each in the frame of the set."""
+    order = np.empty(min(most, len(e_m)), np.int64)
+    is_taken = np.zeros(len(e_m), np.bool_)
+    for n in range(len(order)):
+        best = -1
+        for k in range(len(e_m)):
+            if not is_taken[k] and (best < 0 or _is_better(k, best, candidates, support, e_m)):
+                best = k
+        order[n] = best
+        is_taken[best] = True
+    return order, _covariances(scatter[order], headings[candidates[order]], deviations)

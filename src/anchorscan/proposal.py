@@ -43,6 +43,7 @@ __all__ = [
     "checked",
     "joined",
     "landmarks",
+    "on_large",
     "proposals",
     "related",
 ]
@@ -318,7 +319,8 @@ def proposals(
 
     Args:
         anchors: Of the scan.
-        points: (N, 2) end points of the returns to check with, metres, scan frame.
+        points: (N, 2) end points of the returns to check with, metres, scan frame; or (N, 3)
+            ``verification.readings``, of which those on small things are passed over.
         known: Landmarks of the references, all of them or several lots.
         tiles: The map stitched from them.
         settings: Of the search.
@@ -355,8 +357,8 @@ def checked(
 
     Args:
         poses: T_set_laser, metres and radians.
-        points: (N, 2) or more columns, end points of the returns to check with, metres, scan
-            frame.
+        points: (N, 2) end points of the returns to check with, metres, scan frame; or (N, 3)
+            ``verification.readings``, of which those on small things are passed over.
         tiles: The map.
         settings: How many readings and proposals.
     """
@@ -372,9 +374,22 @@ def _passing(
     settings: ProposalSettings,
 ) -> Proposals:
     """Those of the first poses, with headings in 65,536ths of a turn, that pass the first check."""
-    chosen = spread(points, settings.readings)
-    poses, scores = _checked(chosen, tiles, out, found, settings.most)
+    sieve = (settings.readings, settings.most)
+    poses, scores = _passed(points, tiles, out, found, sieve)
     return Proposals(poses, scores, found)
+
+
+@kernel
+def on_large(readings):  # type: ignore[no-untyped-def]
+    """Those of (N, 3) readings that are not on small things; all where nobody says."""
+    large = np.empty(readings.shape)
+    found = 0
+    for i in range(len(readings)):
+        if readings.shape[1] < 3 or readings[i, 2] == 0.0:
+            for j in range(readings.shape[1]):
+                large[found, j] = readings[i, j]
+            found += 1
+    return large[:found]
 
 
 @kernel
@@ -622,3 +637,9 @@ def _highest(poses, scores, full, most):  # type: ignore[no-untyped-def]
         values[taken] = scores[k] / full
         taken += 1
     return best, values
+
+
+@kernel
+def _passed(readings, tiles, out, found, sieve):  # type: ignore[no-untyped-def]
+    """The best of the first ``found`` poses by some readings on large things."""
+    return _checked(spread(on_large(readings), sieve[0]), tiles, out, found, sieve[1])

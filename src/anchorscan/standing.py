@@ -77,8 +77,7 @@ def standing(
     Args:
         known: The places that come into question.
         main_angle: Of the scan, radians; NaN for none.
-        points: (N, 2) or more columns, end points of the returns to check with, metres, scan
-            frame.
+        points: (N, 2) or (N, 3) readings of the scan to check with, see ``proposal.checked``.
         tiles: The map.
         settings: How many readings and proposals.
 

@@ -19,11 +19,12 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from ._jit import kernel
 from .anchors import AnchorStack, stack_anchors
 from .database import RelationshipDatabase, Votes, quality
 from .decision import Decision, covariance, decide
 from .description import Description, describe, looks
-from .evaluation import evaluate_outlines
+from .evaluation import evaluation, tolerances
 from .field import FieldArrays, LikelihoodField
 from .graph import anchor_graph
 from .hypothesis import Hypothesis
@@ -46,7 +47,7 @@ from .settings import Settings
 from .spacing import spacings
 from .standing import Places, places, standing
 from .tiles import Tiles
-from .verification import Fits, follow, on_large, settled, verify
+from .verification import Fits, follow, settled, verify
 
 __all__ = ["MapSearch", "StitchedMap", "candidates"]
 
@@ -328,14 +329,13 @@ class StitchedMap:
         """Let relations propose poses, sieve and refine them."""
         settings, tiles = self._settings, content.tiles
         seen = description.readings
-        large = on_large(seen)
         votes = None if most is None else self._candidates(description, most, content)
         related = content.landmarks if votes is None else self._some(votes.references, content)
-        proposed = proposals(description.anchors, large, related, tiles, settings.proposal)
+        proposed = proposals(description.anchors, seen, related, tiles, settings.proposal)
         poses = proposed.poses
         if not len(poses):
             walls = description.anchors.main_angle
-            proposed = standing(content.places, walls, large, tiles, settings.proposal)
+            proposed = standing(content.places, walls, seen, tiles, settings.proposal)
             poses = settled(proposed.poses, seen, tiles, settings.verification)
         fits = verify(poses, seen, tiles, self._weights, settings.verification)
         return votes, proposed, fits
@@ -354,16 +354,18 @@ class StitchedMap:
         poses, scores = fits.poses.tolist(), fits.features[:, 0].tolist()
         covariances = covariance(fits, settings.decision)
         probabilities = decision.probabilities.tolist()
+        agreement = [
+            compared(description, each.description, T_reference_scan, settings)
+            for each, T_reference_scan in zip(known, found[2], strict=True)
+        ]
         hypotheses = tuple(
             Hypothesis(
                 reference=each.reference.identifier,
                 pose_in_reference=Pose2D(*T_reference_scan[n]),
                 pose=Pose2D(*poses[n]),
                 covariance=covariances[n],
-                evaluation=evaluate_outlines(
-                    description.outline, each.description.outline, found[2][n], settings.evaluation
-                ),
-                quality=quality(description.graph, each.description.graph, settings.database),
+                evaluation=agreement[n][0],
+                quality=agreement[n][1],
                 score=scores[n],
                 probability=probabilities[n],
                 accepted=decision.accepted and n == 0,
@@ -466,6 +468,41 @@ def candidates(
         first = (votes.references[:compared], votes.quality[:compared])
         found.append((votes, worths(look.view, *first)))
     return reordered(found, most)
+
+
+def compared(
+    ours: Description,
+    theirs: Description,
+    T_reference_scan: NDArray[np.float64],
+    settings: Settings,
+) -> tuple[float, float]:
+    """Compare a scan with a reference: e_m (section 5) and q_m (section 4.1).
+
+    Args:
+        ours: Description of the scan.
+        theirs: That of the reference.
+        T_reference_scan: (3,) x, y, theta, metres and radians.
+        settings: Of all stages.
+    """
+    e_m, q_m = _compared(
+        (ours.outline.rows, ours.outline.geometry, ours.graph.lengths),
+        (theirs.outline.rows, theirs.outline.geometry, theirs.graph.lengths),
+        T_reference_scan,
+        tolerances(settings.evaluation),
+        (settings.database.length_tolerance, settings.database.count_once),
+    )
+    return e_m, q_m
+
+
+@kernel
+def _compared(ours, theirs, T_reference_scan, tolerances, relation):  # type: ignore[no-untyped-def]
+    """Compare two outlines and two graphs by the lengths of their edges, in one call."""
+    rows, geometry, lengths = ours
+    other_rows, other_geometry, other_lengths = theirs
+    return (
+        evaluation(rows, geometry, other_rows, other_geometry, T_reference_scan, tolerances),
+        quality(lengths, other_lengths, relation[0], relation[1]),
+    )
 
 
 class _Passed(Iterator[Value]):

@@ -45,7 +45,6 @@ __all__ = [
     "Fits",
     "VerificationSettings",
     "follow",
-    "on_large",
     "readings",
     "settled",
     "verify",
@@ -135,19 +134,6 @@ def readings(angles: AngleFunction, settings: VerificationSettings) -> NDArray[n
         angles.points, angles.runs, angles.way, settings.small_extent
     )
     return told
-
-
-@kernel
-def on_large(readings):  # type: ignore[no-untyped-def]
-    """Those of (N, 3) readings that are not on small things."""
-    large = np.empty(readings.shape)
-    found = 0
-    for i in range(len(readings)):
-        if readings[i, 2] == 0.0:
-            for j in range(3):
-                large[found, j] = readings[i, j]
-            found += 1
-    return large[:found]
 
 
 @kernel
