@@ -240,7 +240,10 @@ def nearest(
         (K,) its lot, or -1 where there is no reference at all, its place there, and (K, 3)
         ``T_reference_laser``.
     """
-    found, costs, relative = _nothing(len(poses))
+    found, costs = np.empty((len(poses), 2), np.int64), np.empty(len(poses))
+    found.fill(-1)
+    costs.fill(np.inf)
+    relative = np.zeros((len(poses), 3))
     for number, lot in enumerate(lots):
         if len(lot.poses):
             known = (lot.poses, lot.is_there)
@@ -252,12 +255,6 @@ def _cells(poses: NDArray[np.float64]) -> NDArray[np.int64]:
     """(N,) one integer for the cell of each pose."""
     cells = np.clip(np.floor(poses[:, :2] / _CELL), -_FARTHEST, _FARTHEST).astype(np.int64)
     return (cells[:, 0] << 32) + cells[:, 1]
-
-
-@kernel
-def _nothing(count):  # type: ignore[no-untyped-def]
-    """Lot and place of the nearest reference, its cost, and the pose relative to it: none yet."""
-    return np.full((count, 2), -1), np.full(count, np.inf), np.zeros((count, 3))
 
 
 @kernel
