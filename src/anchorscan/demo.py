@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from .drawing import LIGHT, ruler
 from .errors import MissingExtraError
 from .hypothesis import Hypothesis
 from .io import open_log
@@ -40,7 +41,6 @@ _PICTURE = "killian-court.png"
 # Okabe and Ito's colours, told apart with any colour vision; the shapes differ as well.
 _INK, _WALL = "#222222", "#8a8a8a"
 _RIGHT, _WRONG, _UNKNOWN = "#0072b2", "#d55e00", "#cc79a7"
-_FAINT = "#cccccc"
 _MARGIN = 4.0
 _NOSE = 1.5
 _CUT = 2.0
@@ -321,27 +321,8 @@ def _zoom(axes: Axes, points: NDArray[np.float64]) -> None:
 
 
 def _frame(axes: Axes) -> None:
-    """Draw a scale instead of axes: only lengths mean something to the reader."""
     axes.set_aspect("equal")
-    axes.set_xticks([])
-    axes.set_yticks([])
-    for side in axes.spines.values():
-        side.set_color(_FAINT)
-    left, right = axes.get_xlim()
-    bottom, top = axes.get_ylim()
-    length = next(each for each in (50.0, 20.0, 10.0, 5.0, 2.0, 1.0) if each < 0.4 * (right - left))
-    x, y = left + 0.04 * (right - left), bottom + 0.04 * (top - bottom)
-    axes.plot([x, x + length], [y, y], "-", color=_INK, lw=2.0, solid_capstyle="butt", zorder=6)
-    axes.annotate(
-        f"{length:g} m",
-        (x + 0.5 * length, y),
-        (0, 3),
-        textcoords="offset points",
-        ha="center",
-        va="bottom",
-        fontsize=8,
-        color=_INK,
-    )
+    ruler(axes, LIGHT)
 
 
 def _save(figure: Figure, path: Path) -> None:
