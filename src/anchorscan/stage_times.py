@@ -34,6 +34,7 @@ STAGES: Mapping[str, str] = {
     "verification": "evaluation",
     "decision": "decision",
     "verification._fit": "refinement",
+    "stitched_map.compared": "evaluation",
 }
 """The stage of each module, and of single functions that do the work of another stage."""
 
