@@ -36,6 +36,7 @@ def same(ours, theirs):
 
 def check_stages(scan, settings):
     whole = describe(scan, settings)
+    scan = scan.thinned(settings.anchors.finest_increment)
     angles = angle_function(scan, settings.anchors.angle_function)
     same(whole.angles, angles)
     same(whole.surfaces, segments(angles, settings.anchors.segments))

@@ -59,3 +59,27 @@ def test_the_turntable_of_a_real_sensor_closes(real_records):
 def test_an_increment_that_is_no_angle_is_refused(increment):
     with pytest.raises(ScanError, match="increment"):
         LaserScan(np.ones(3), 0.0, increment)
+
+
+@given(
+    st.integers(0, 400),
+    st.floats(math.radians(0.02), math.radians(2.0)),
+    st.sampled_from([1.0, -1.0]),
+    st.floats(0.0, math.radians(3.0)),
+)
+def test_a_thinned_scan_has_readings_of_the_first_none_closer_than_asked(
+    count, increment, sense, finest
+):
+    scan = LaserScan(np.arange(count, dtype=np.float32), 0.3, sense * increment)
+    thin = scan.thinned(finest)
+    every = max(math.floor(finest / increment + 1e-4), 1)
+    assert thin.ranges.tolist() == scan.ranges[::every].tolist()
+    np.testing.assert_allclose(thin.angles, scan.angles[::every], atol=1e-9)
+    assert (thin is scan) == (every == 1)
+
+
+def test_a_laser_of_many_readings_still_closes_when_they_are_thinned():
+    scan = LaserScan(np.ones(3200), -math.pi, 2.0 * math.pi / 3200.0)
+    thin = scan.thinned(math.radians(0.5))
+    assert len(thin) == 800
+    assert thin.is_full_turn

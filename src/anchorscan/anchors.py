@@ -91,6 +91,11 @@ class AnchorSettings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
+    finest_increment: float = Field(
+        math.radians(0.5),
+        ge=0.0,
+        description="readings closer to each other are left out, radians; 0 takes all",
+    )
     angle_function: AngleFunctionSettings = AngleFunctionSettings()
     segments: SegmentSettings = SegmentSettings()
     smallest_rim_angle: float = Field(

@@ -44,7 +44,7 @@ class Description:
     What the matching does not ask for again is derived anew for whoever looks at it.
 
     Args:
-        scan: The scan.
+        scan: The scan, thinned where a laser looks closer than ``finest_increment``.
         anchors: Anchor points (section 3).
         graph: Anchor graph (section 4).
         outline: What it saw, for the evaluation (section 5).
@@ -120,7 +120,11 @@ def describe(scan: LaserScan, settings: Settings) -> Description:
 
     It is what the functions of the stages give one by one, in one kernel: to call ten of them
     from Python took longer than what they do, and so does every array that is handed back.
+
+    A laser that looks closer than the finest increment shows no more of a place, only more often:
+    some of its readings are left out.  The paper, whose scans had a degree, says nothing of that.
     """
+    scan = scan.thinned(settings.anchors.finest_increment)
     anchors, edges, outline, readings = _described(
         scan.ranges,
         sweep(scan),

@@ -72,9 +72,10 @@ class Trace:
         Raises:
             ValueError: The hypothesis is not one of this trace.
         """
+        finest = self.settings.anchors.finest_increment
         return evaluate(
-            self.scan,
-            self.reference(hypothesis.reference).scan,
+            self.description.scan,
+            self.reference(hypothesis.reference).scan.thinned(finest),
             hypothesis.pose_in_reference,
             self.settings.evaluation,
             self.settings.anchors.angle_function,

@@ -59,7 +59,11 @@ _MAP: Mapping[str, Any] = {
 # freiburg-079, csail and Killian Court; intel, freiburg-101 and wean had no part in that.
 _PAPER: Mapping[str, Any] = {
     "method": "references",
-    "anchors": {"smallest_wall": 0.5, "smallest_turn": math.radians(30.0)},
+    "anchors": {
+        "finest_increment": 0.0,
+        "smallest_wall": 0.5,
+        "smallest_turn": math.radians(30.0),
+    },
     "database": {
         "relation": "length",
         "length_tolerance": 0.06,
