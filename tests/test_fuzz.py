@@ -16,12 +16,15 @@ from fuzz import targets
 from fuzz.mutation import mutated
 from fuzz.targets import TARGETS, HungryError, SlowError, Target, execute
 
+from anchorscan import Record
+
 # Executions that take about a second.
-RUNS = {"bag": 150, "bag-metadata": 100, "bag-message": 30, "set-sealed": 200, "map-scans": 200}
-RUNS |= {"index": 100, "scan": 200, "scan-paper": 200, "tum": 500, "set": 200, "map": 600}
+RUNS = {"bag-metadata": 200, "set-sealed": 200, "map-scans": 500, "index": 100}
+RUNS |= {"scan": 200, "scan-paper": 200, "set": 200, "map": 600}
 USUAL = 1000
-NEEDS = {"bag": "rosbags", "bag-metadata": "rosbags", "bag-message": "rosbags", "map": "PIL"}
-NEEDS |= {"map-scans": "PIL"}
+LOGS = ("carmen", "g2o", "csv", "tum", "numpy", "archive")
+RECORDINGS = ("bag", "bag-metadata", "bag-message")
+NEEDS = dict.fromkeys(RECORDINGS, "rosbags") | dict.fromkeys(("map", "map-scans"), "PIL")
 
 
 @pytest.mark.parametrize("name", TARGETS)
@@ -39,6 +42,20 @@ def test_damage_at_random_does_no_harm(name: str, tmp_path: Path) -> None:
             execute(target, data, tmp_path)
         except Exception as error:
             pytest.fail(f"{type(error).__name__}: {error} on {data!r}")
+
+
+@pytest.mark.parametrize("name", [*LOGS, *RECORDINGS])
+def test_what_logs_are_damaged_from_is_sound(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if name in NEEDS:
+        pytest.importorskip(NEEDS[name])
+    records: list[Record] = []
+    monkeypatch.setattr(targets, "_check_records", records.extend)
+    for seed in TARGETS[name].seeds():
+        TARGETS[name].check(seed, tmp_path)
+    assert any(record.scan is not None for record in records)
+    assert name in RECORDINGS or any(record.pose is not None for record in records)
 
 
 def test_a_target_that_hangs_or_hoards_is_caught(

@@ -97,8 +97,8 @@ def csv() -> list[bytes]:
 
 
 def tum() -> list[bytes]:
-    """TUM trajectories."""
-    rows = "".join(f"{i} {i} 0 0 0 0 0.1 0.99\n" for i in range(4))
+    """TUM trajectories, dense enough for the times of the scans to lie between two poses."""
+    rows = "".join(f"{0.4 * i:.1f} {i} 0 0 0 0 0.1 0.99\n" for i in range(5))
     return [b"# time x y z\n" + rows.encode(), rows.replace(" ", ",").encode()]
 
 
@@ -148,19 +148,48 @@ def _recordings() -> list[tuple[str, bytes]]:
             path = messages.write(Path(folder))
             parts = [path] if path.is_file() else sorted(path.glob(f"*.{ending}"))
             found.append((ending, parts[0].read_bytes()))
-            if path.is_dir() and storage == "sqlite3":
-                found.append(("yaml", (path / "metadata.yaml").read_bytes()))
     return found
 
 
 def bags() -> list[bytes]:
     """Recordings in every storage."""
-    return [content for ending, content in _recordings() if ending != "yaml"]
+    return [content for _, content in _recordings()]
 
 
 def metadata() -> list[bytes]:
-    """The description of a rosbag2 folder."""
-    return [content for ending, content in _recordings() if ending == "yaml"]
+    """The description of a rosbag2 folder: what is read of it, the rest costs a millisecond."""
+    topic = {"name": "/scan", "type": "sensor_msgs/msg/LaserScan", "serialization_format": "cdr"}
+    told = {
+        "version": 9,
+        "storage_identifier": "sqlite3",
+        "relative_file_paths": ["run.db3"],
+        "duration": {"nanoseconds": 9},
+        "starting_time": {"nanoseconds_since_epoch": 1},
+        "message_count": 2,
+        "topics_with_message_count": [{"topic_metadata": topic, "message_count": 2}],
+    }
+    rows = """\
+rosbag2_bagfile_information:
+  compression_mode: ''
+  duration:
+    nanoseconds: 9
+  files: []
+  message_count: 2
+  relative_file_paths:
+  - run.db3
+  starting_time:
+    nanoseconds_since_epoch: 1
+  storage_identifier: sqlite3
+  topics_with_message_count:
+  - message_count: 2
+    topic_metadata:
+      name: /scan
+      offered_qos_profiles: ''
+      serialization_format: cdr
+      type: sensor_msgs/msg/LaserScan
+  version: 4
+"""
+    return [rows.encode(), json.dumps({"rosbag2_bagfile_information": told}).encode()]
 
 
 def storage() -> bytes:

@@ -7,6 +7,7 @@ more memory than follows from the size of the input.
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import gc
 import gzip
@@ -15,13 +16,16 @@ import math
 import resource
 import sqlite3
 import struct
+import tempfile
 import time
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Iterator
 from contextlib import closing
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
+from typing import Any
+from unittest import mock
 
 import numpy as np
 
@@ -32,6 +36,7 @@ from anchorscan import (
     LogError,
     Matcher,
     Pose2D,
+    Record,
     Reference,
     ReferenceSet,
     ReferenceSetError,
@@ -45,6 +50,9 @@ from anchorscan import (
 from anchorscan.answers import read_runs
 from anchorscan.array_file import read_arrays, write_arrays
 from anchorscan.derived_index import _made_of, index_path
+from anchorscan.io import _tum_file
+from anchorscan.io.log import Report
+from anchorscan.io.posed_log import PosedLog
 from anchorscan.set_file import _Header, _seal, _store_header
 
 from . import seeds
@@ -147,13 +155,32 @@ _CLOCK = "PARAM laser_front_laser_resolution 1.0 1.0 host 0\n" + "".join(
 )
 
 
+class _KeptLog(Log):
+    """A log that was read before: it is not what is looked at."""
+
+    def __init__(self, log: Log) -> None:
+        super().__init__(log.path)
+        self._kept = tuple(log)
+
+    def _read(self, report: Report) -> Iterator[Record]:
+        yield from self._kept
+
+
+@functools.cache
+def _clock() -> _KeptLog:
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "clock.log"
+        path.write_text(_CLOCK, encoding="ascii")
+        return _KeptLog(open_log(path))
+
+
 def _tum(data: bytes, folder: Path) -> None:
-    clock, poses = folder / "clock.log", folder / "poses.tum"
-    if not clock.exists():
-        clock.write_text(_CLOCK, encoding="ascii")
-    poses.write_bytes(data)
+    path = folder / "poses.tum"
+    path.write_bytes(data)
     try:
-        _check_records(open_log(clock, poses=poses, poses_of="laser"))
+        poses = _tum_file(path, _clock().path)
+        assert poses is not None
+        _check_records(PosedLog(_clock(), poses, "laser"))
     except LogError as error:
         _one_line(error)
 
@@ -198,28 +225,67 @@ def _bag(data: bytes, folder: Path) -> None:
 def _metadata(data: bytes, folder: Path) -> None:
     home = folder / "rosbag2"
     home.mkdir(exist_ok=True)
-    storage = home / "run.db3"
-    if not storage.exists():
-        storage.write_bytes(_storage())
+    (home / "run.db3").touch()
     (home / "metadata.yaml").write_bytes(data)
-    _check_log(home)
-
-
-@functools.cache
-def _storage() -> bytes:
-    return seeds.storage()
+    with _kept_storage(None):
+        _check_log(home)
 
 
 def _message(data: bytes, folder: Path) -> None:
     path = folder / "log.db3"
     if not path.exists():
-        path.write_bytes(_storage())
-    with closing(sqlite3.connect(path)) as connection:
-        connection.execute("PRAGMA journal_mode = MEMORY")
-        connection.execute("PRAGMA synchronous = OFF")
-        connection.execute("UPDATE messages SET data = ?", (data,))
-        connection.commit()
-    _check_log(path)
+        path.write_bytes(seeds.storage())
+    with _kept_storage(data):
+        _check_log(path)
+
+
+@contextlib.contextmanager
+def _kept_storage(data: bytes | None) -> Iterator[None]:
+    """Have rosbags take a storage that was read before for any, perhaps with other messages.
+
+    The storage itself is what the target `bag` is for.
+    """
+    from rosbags.rosbag2 import reader
+
+    connections, metadata, messages = _stored()
+
+    class Kept:
+        def __init__(self, path: Path) -> None:
+            self.metadata, self.connections = metadata, list(connections)
+
+        def open(self) -> None:
+            """Nothing is to be opened."""
+
+        def close(self) -> None:
+            """Nothing is to be closed."""
+
+        def messages(self, wanted: Collection[Any], *_: Any) -> Iterator[tuple[Any, int, bytes]]:
+            for connection, stamp, content in messages:
+                if connection in wanted:
+                    yield connection, stamp, content if data is None else data
+
+    with (
+        mock.patch.dict(reader.Reader.STORAGE_PLUGINS, {".db3": Kept}),
+        mock.patch.dict(reader.DirectoryReader.STORAGE_PLUGINS, {"sqlite3": Kept}),
+    ):
+        yield
+
+
+@functools.cache
+def _stored() -> tuple[tuple[Any, ...], Any, tuple[tuple[Any, int, bytes], ...]]:
+    """What rosbags reads of a sound storage: connections, metadata and messages."""
+    from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
+
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "run.db3"
+        path.write_bytes(seeds.storage())
+        storage = Sqlite3Reader(path)
+        storage.open()
+        try:
+            found = tuple(storage.messages(storage.connections))
+            return tuple(storage.connections), storage.metadata, found
+        finally:
+            storage.close()
 
 
 def _check_set(places: ReferenceSet) -> None:
@@ -244,8 +310,6 @@ def _set(data: bytes, folder: Path) -> None:
 
 @functools.cache
 def _empty_set() -> bytes:
-    import tempfile
-
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "a.apr"
         ReferenceSet(path=path).close()
@@ -312,8 +376,6 @@ _INDEXED = (Settings(), Settings.preset().changed({"database": {"candidates": 1}
 @functools.cache
 def _indexed(kind: int) -> tuple[bytes, dict[str, np.ndarray]]:
     """A set's file, and the arrays of its index, by one kind of settings."""
-    import tempfile
-
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "a.apr"
         with ReferenceSet(path=path, settings=_INDEXED[kind]) as places:
@@ -381,7 +443,7 @@ def _index(data: bytes, folder: Path) -> None:
     write_arrays(index_path(path), arrays, _made_of(_INDEXED[kind]), room)
     asked = _rooms()[0].scan
     try:
-        with ReferenceSet.open(path) as places:
+        with ReferenceSet.open(path, settings=_INDEXED[kind]) as places:  # not read every time
             places._matcher = places._indexed()
             if places._matcher is None:  # without its index the set is the same every time
                 _check_set(places)
