@@ -216,7 +216,7 @@ class TestWhatFuzzingFound:
         self, right: bytes, wrong: bytes, tmp_path: Path
     ) -> None:
         pytest.importorskip("rosbags")
-        (metadata,) = seeds.metadata()
+        metadata, _ = seeds.metadata()
         assert metadata != metadata.replace(right, wrong)
         (tmp_path / "metadata.yaml").write_bytes(metadata.replace(right, wrong))
         (tmp_path / "run.db3").write_bytes(seeds.storage())
