@@ -17,6 +17,7 @@ from anchorscan import (
     Pose2D,
     Record,
     Reference,
+    SensorModel,
     Settings,
     drive,
     random_building,
@@ -67,6 +68,23 @@ def test_the_readings_that_agree_are_those_that_e_counts(several: list[Explanati
             agree = np.sum(comparison.readings == Reading.AGREES)
             returns = comparison.front.is_return.sum()
             assert agree / returns == pytest.approx(hypothesis.evaluation, abs=1.01 / returns)
+
+
+def test_of_a_laser_of_many_readings_those_that_are_looked_at_are_compared() -> None:
+    building = random_building(5)
+    sensor = SensorModel(field_of_view=2.0 * math.pi, resolution=2.0 * math.pi / 3200)
+    references = drive(building, sensor, seed=1, length=8.0)[::8]
+    query = drive(building, sensor, seed=1, length=8.0)[10]
+    for preset, most in (("default", 800), ("paper", 3200)):
+        explanation = explained(references, query, preset)
+        comparison = explanation.comparison
+        assert 0.9 * most <= len(comparison.front) <= most + 1
+        agree = np.sum(comparison.readings == Reading.AGREES) / comparison.front.is_return.sum()
+        best = explanation.trace.hypotheses[0]
+        assert agree == pytest.approx(best.evaluation, abs=2e-3)
+        assert best.pose is not None
+        assert query.pose is not None
+        assert best.pose.distance(query.pose) < 0.1
 
 
 def test_real_readings_that_agree_are_those_that_e_counts(

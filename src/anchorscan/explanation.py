@@ -191,9 +191,11 @@ def compare(trace: Trace, hypothesis: Hypothesis) -> Comparison:
     """
     evaluation = trace.evaluation(hypothesis)
     if evaluation.overview == "reference":
-        front, T_reference_front = trace.scan, hypothesis.pose_in_reference
+        front, T_reference_front = trace.description.scan, hypothesis.pose_in_reference
     else:
-        front, T_reference_front = trace.reference(hypothesis.reference).scan, Pose2D()
+        finest = trace.settings.anchors.finest_increment
+        front = trace.reference(hypothesis.reference).scan.thinned(finest)
+        T_reference_front = Pose2D()
     seen = front.ranges.astype(np.float64)
     made = evaluation.synthetic.ranges.astype(np.float64)
     rule = trace.settings.evaluation
