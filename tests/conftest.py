@@ -68,7 +68,7 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 # Few tests that take long: begun last, one core would wait for them alone.
-_LONG = ("test_interpreted.py", "test_documentation.py")
+_LONG = ("test_cluster.py", "test_documentation.py")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
