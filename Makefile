@@ -19,7 +19,7 @@ FUZZ_SECONDS ?= 3600
 
 .DEFAULT_GOAL := help
 .PHONY: help setup check test ros-test bench docs release demo picture lock clean
-.PHONY: fuzz test-lowest test-newest test-versions audit kernels package
+.PHONY: fuzz test-lowest test-newest test-versions audit kernels package wheel smoke
 
 help: ## show this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-11s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -97,13 +97,18 @@ kernels: setup ## compile the kernels once, so that processes side by side do no
 		all_of = [Matcher((), Settings.preset(name)) for name in ("default", "paper")]; \
 		[each.prepare() for each in all_of]; Localizer(all_of[0]).prepare()'
 
-package: setup ## build both distributions and try the wheel in an empty environment
+package: wheel ## build both distributions and try the wheel in an empty environment
+	$(MAKE) --no-print-directory smoke
+
+wheel: setup
 	rm -rf dist $(VENV)-package
 	$(BIN)/python -m build --no-isolation --quiet
 	$(PYTHON) -m venv $(VENV)-package 2>/dev/null || { \
 		$(PYTHON) -m venv --clear --without-pip $(VENV)-package && \
 		$(PYTHON) -m pip --python $(VENV)-package/bin/python install --quiet pip; }
 	$(VENV)-package/bin/python -m pip install --quiet --disable-pip-version-check dist/*.whl
+
+smoke: # what `make wheel` has installed; it compiles everything once more
 	cd dist && ../$(VENV)-package/bin/anchorscan --version && \
 		../$(VENV)-package/bin/python ../tests/smoke.py
 
