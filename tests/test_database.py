@@ -14,7 +14,7 @@ from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, 
 
 from anchorscan import database
 from anchorscan.anchors import AnchorPoints
-from anchorscan.database import DatabaseSettings, RelationshipDatabase
+from anchorscan.database import DatabaseSettings, RelationshipDatabase, _frequent
 from anchorscan.graph import AnchorGraph, GraphSettings, anchor_graph
 
 TOLERANCE = 0.1
@@ -157,18 +157,31 @@ def test_spacings_choose_as_plain_comparing_does(count):
         assert set(searched.votes(query, most, own).references.tolist()) == set(expected)
 
 
-def test_spacings_choose_only_from_those_of_the_most_votes():
+@pytest.mark.parametrize("looks", [1, 2])
+def test_spacings_choose_only_from_those_of_the_most_votes(looks):
     rng = np.random.default_rng(4)
     graphs = [(k, graph_of(rng.uniform(0.0, 6.0, 12))) for k in range(300)]
-    settings = by_length().model_copy(update={"shortlisted": 20})
+    settings = by_length().model_copy(update={"shortlisted": 40})
     searched = RelationshipDatabase(settings, graphs, map(some_spacings, range(300)))
     query, own = graph_of(rng.uniform(0.0, 6.0, 12)), some_spacings(299)
-    first = searched.votes(query, 20)
-    chosen = searched.votes(query, 10, own)
+    everything = searched.votes(query)
+    chosen = searched.votes(query, 10, own, looks)
     # Those that are about as good as the last one may be among them.
-    assert chosen.quality.min() >= 0.98 * first.quality.min()
-    assert set(chosen.references.tolist()) - set(first.references[:10].tolist())
+    assert chosen.counts.min() >= 0.99 * np.sort(everything.counts)[-40 // looks]
+    assert set(chosen.references.tolist()) - set(everything.references[:10].tolist())
     assert np.all(np.diff(chosen.quality) <= 0.0)
+
+
+@given(st.lists(st.integers(0, 3000), min_size=1, max_size=300), st.integers(1, 60))
+def test_no_count_that_is_left_out_is_larger_than_one_that_is_chosen(counts, most):
+    counts = np.array(counts, np.float32) / np.float32(256.0)
+    chosen = _frequent(counts, most)
+    others = np.delete(counts, chosen)
+    assert len(set(chosen.tolist())) == len(chosen) >= min(most, len(counts))
+    assert others.max(initial=-1.0) <= counts[chosen].min()
+    # Beyond those asked for, only such as are about as large as the last of these.
+    last = np.sort(counts)[::-1][: min(most, len(counts))][-1]
+    assert counts[chosen].min() >= last - counts.max() / 4000.0
 
 
 def test_there_are_as_many_spacings_as_references():

@@ -241,6 +241,21 @@ def test_no_more_database_edges_are_looked_at_than_allowed_and_rare_ones_first(m
     assert (len(left) == 0) == (most == 100_000)
 
 
+@given(st.integers(0, 1 << 30), st.integers(1, 400), st.integers(1, 200))
+def test_two_looks_share_the_work_of_one(seed, most, opening):
+    query = random_anchors(seed, 7)
+    graphs = [graph_of(jittered(query, k, 0.1)) for k in range(12)]
+    allowed = {"most_edges": 10_000, "most_votes": 2 * most, "most_opening": 2 * opening}
+    half = allowed | {"most_votes": most, "most_opening": opening}
+    found = []
+    for settings, looks in ((allowed, 2), (half, 1)):
+        relation = OrientedRelation(OrientedSettings(**settings))
+        edges, _ = relation.edges(graphs, 0)
+        slots, counts = relation.met(graph_of(query), [edges], 12, 12, looks)
+        found.append(dict(zip(slots.tolist(), counts.tolist(), strict=True)))
+    assert found[0] == found[1]
+
+
 @given(st.integers(0, 1 << 30), st.integers(1, 400))
 def test_what_the_rarest_keys_meet_is_counted_in_full_and_nothing_else(seed, opening):
     query = random_anchors(seed, 7)

@@ -16,7 +16,7 @@ they have become of a size.  Removing marks the reference and leaves its edges u
 large merge.  So a reader keeps what it has begun with, and writing costs little.
 
 Among very many references the votes leave thousands about as good.  So the database can also hold
-which spacings of walls each one saw (``spacing``): of the references with the most votes those
+which spacings of walls each one saw (``spacing``): of the references with the largest n_m those
 are taken of which ``0.3 * log(q_m)`` and the likeness of the spacings together are largest.
 """
 
@@ -83,12 +83,12 @@ class DatabaseSettings(BaseModel):
         None, ge=1, description="references that are followed further; null for all"
     )
     shortlisted: int = Field(
-        4000,
+        8000,
         ge=0,
         description="references of the most votes that the spacings of walls choose these from",
     )
     compared: int = Field(
-        500,
+        400,
         ge=0,
         description="references in a map that are compared by what they saw to choose these",
     )
@@ -277,6 +277,7 @@ class RelationshipDatabase:
         graph: AnchorGraph,
         most: int | None = None,
         spacings: NDArray[np.uint64] | None = None,
+        looks: int = 1,
     ) -> Votes:
         """Count corresponding edges and compute the quality measure (section 4.1).
 
@@ -284,16 +285,19 @@ class RelationshipDatabase:
             graph: Of the scan that is looked for.
             most: How many references to return; None for all.
             spacings: (3,) of the walls that it saw (``spacing``): they choose the references
-                from the first ``shortlisted`` by quality.
+                from the first ``shortlisted`` by n_m.
+            looks: Into so many the work for this scan is divided.
         """
         state = self._state
-        slots, counts = self._relation.met(graph, state.parts, state.used, state.alive)
+        slots, counts = self._relation.met(graph, state.parts, state.used, state.alive, looks)
         edges = (self._relation.size(graph), self._fewest)
         if most is not None and most < len(slots):
             some, of_some = slots, counts
             if len(slots) > _FEW:
-                first = most if spacings is None else max(most, self._shortlisted)
-                chosen = _promising(slots, counts, state.sizes, edges, first)
+                if spacings is None:
+                    chosen = _promising(slots, counts, state.sizes, edges, most)
+                else:
+                    chosen = _frequent(counts, max(most, self._shortlisted // looks))
                 some, of_some = slots[chosen], counts[chosen]
             if spacings is not None and most < len(some):
                 chosen = _alike(some, of_some, state, edges, spacings, most)
@@ -460,6 +464,32 @@ def _with_room(values: NDArray[Number], slot: int) -> NDArray[Number]:
     longer = np.zeros((max(2 * len(values), 64), *values.shape[1:]), values.dtype)
     longer[: len(values)] = values
     return longer
+
+
+@kernel
+def _frequent(counts, most):  # type: ignore[no-untyped-def]
+    """Places of the ``most`` largest counts, and of some that are about as large.
+
+    Not the quality decides: to read a size for every one of them takes longer than all else here.
+    """
+    highest = np.float32(1e-9)
+    for k in range(len(counts)):
+        highest = max(highest, counts[k])
+    scale = np.float32(_BINS - 1) / highest
+    reached = np.zeros(_BINS, np.int64)
+    for k in range(len(counts)):
+        reached[int(counts[k] * scale)] += 1
+    least, enough = _BINS, 0
+    while least > 0 and enough < most:
+        least -= 1
+        enough += reached[least]
+    chosen = np.empty(enough, np.int64)
+    found = 0
+    for k in range(len(counts)):
+        if int(counts[k] * scale) >= least:
+            chosen[found] = k
+            found += 1
+    return chosen
 
 
 @kernel

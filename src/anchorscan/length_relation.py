@@ -125,7 +125,12 @@ class LengthRelation:
         return len(graph)
 
     def met(
-        self, graph: AnchorGraph, parts: Sequence[EdgesByLength], used: int, alive: int
+        self,
+        graph: AnchorGraph,
+        parts: Sequence[EdgesByLength],
+        used: int,
+        alive: int,
+        looks: int = 1,
     ) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
         """Count the corresponding edges, n_m, of those slots that have any.
 
@@ -136,6 +141,7 @@ class LengthRelation:
             parts: Edges of the references.
             used: Slots in use.
             alive: References among them that count; length alone takes no notice.
+            looks: Into so many the work is divided; length alone takes no notice.
 
         Returns:
             (M,) slots and (M,) n_m.

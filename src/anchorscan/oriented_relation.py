@@ -241,7 +241,12 @@ class OrientedRelation:
         return int(((lengths >= settings.shortest_edge) & (lengths <= settings.longest_edge)).sum())
 
     def met(
-        self, graph: AnchorGraph, parts: Sequence[EdgesByKey], used: int, alive: int
+        self,
+        graph: AnchorGraph,
+        parts: Sequence[EdgesByKey],
+        used: int,
+        alive: int,
+        looks: int = 1,
     ) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
         """Count the corresponding edges by rarity, n_m, of those slots that have any.
 
@@ -253,6 +258,7 @@ class OrientedRelation:
             parts: Edges of the references.
             used: Slots in use.
             alive: References among them that count.
+            looks: Into so many the work is divided.
 
         Returns:
             (M,) slots, and (M,) n_m; valid until this thread counts again.
@@ -269,9 +275,9 @@ class OrientedRelation:
         with np.errstate(divide="ignore", invalid="ignore"):
             rarity = np.log1p(alive / found) / math.log1p(max(alive, 1))
         rarity[found == 0] = 0.0
-        rarity[self._too_common(found)] = 0.0
+        rarity[self._too_common(found, looks)] = 0.0
         weights = np.round(rarity * shares * unit).astype(np.uint16)
-        order, opening = self._rarest_first(found, weights)
+        order, opening = self._rarest_first(found, weights, looks)
         scratch = self._scratch_of(used)
         count = 0
         for part, of_part in zip(parts, ranges, strict=True):
@@ -281,18 +287,19 @@ class OrientedRelation:
         return scratch.slots[:count], scratch.counts[:count]
 
     def _rarest_first(
-        self, found: NDArray[np.int64], weights: NDArray[np.uint16]
+        self, found: NDArray[np.int64], weights: NDArray[np.uint16], looks: int
     ) -> tuple[NDArray[np.int64], int]:
         """Order keys that count by their number of edges, and tell how many of them open."""
         order = np.argsort(found, kind="stable")
         order = order[weights[order] > 0]
         before = np.cumsum(found[order]) - found[order]
-        opening = int(np.searchsorted(before, self._settings.most_opening))
+        most = max(self._settings.most_opening // looks, 1)
+        opening = int(np.searchsorted(before, most))
         return order, opening
 
-    def _too_common(self, found: NDArray[np.int64]) -> NDArray[np.bool_]:
+    def _too_common(self, found: NDArray[np.int64], looks: int) -> NDArray[np.bool_]:
         """Mark the commonest keys where all together are more than may be looked at."""
-        most = self._settings.most_votes
+        most = self._settings.most_votes // looks
         if int(found.sum()) <= most:
             return np.zeros(len(found), np.bool_)
         ordered = np.sort(found)

@@ -462,9 +462,9 @@ def candidates(
             q_m, to a view of the scan.
     """
     compared = settings.database.compared
-    found = []
-    for look in looks(description, settings):
-        votes = database.votes(look.graph, max(most, compared), look.spacings)
+    found, taken = [], looks(description, settings)
+    for look in taken:
+        votes = database.votes(look.graph, max(most, compared), look.spacings, len(taken))
         first = (votes.references[:compared], votes.quality[:compared])
         found.append((votes, worths(look.view, *first)))
     return reordered(found, most)
