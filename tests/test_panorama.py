@@ -193,6 +193,44 @@ def test_worth_is_that_of_plain_comparing(seed, x, y, turn):
         assert got >= found[counts[0]][0] - 0.15
 
 
+@given(st.integers(0, 1 << 30), st.integers(2, 14), st.sampled_from([0.1, 0.5, 2.5]))
+def test_the_shift_that_most_pairs_agree_on_is_tried(seed, count, spread):
+    rng = np.random.default_rng(seed)
+    scan, reference = (
+        AnchorPoints(
+            rng.uniform(-spread, spread, (count, 2)),
+            rng.integers(0, 5, count),
+            rng.integers(0, 4, count) * 0.5 * math.pi,
+            0.0,
+        )
+        for _ in range(2)
+    )
+    plain = list(plain_shifts(scan, reference))
+    turns = [sum(turn == each for each, _, _ in plain) for turn in range(4)]
+    assume(plain and max(turns) <= 48)
+    own, stack = view(np.zeros((0, 2)), scan), stack_anchors([reference])
+    positions, directions = np.empty((20, 2), np.float32), np.empty(20, np.float32)
+    starts, cells = np.empty(panorama._KINDS + 2, np.int64), panorama._CELLS
+    panorama._upright((stack.positions, stack.kinds, stack.directions, stack.main_angles,
+                       stack.starts), 0, positions, directions, starts)  # fmt: skip
+    pairs, tried = np.empty((4, 48, 4), np.float32), np.zeros((2, 4), np.float32)
+    lying = np.zeros(cells * cells, np.uint64)
+    known = (panorama._turned(own.positions), positions, directions, starts)
+    found = panorama._shifts(own, *known, pairs, lying, tried)
+    most = max(number for _, _, number in plain)
+    # What is just as far apart as may be agrees or not, by rounding.
+    assert abs(tried[:found, 3].max() - most) <= 1
+    turn, x, y, number = tried[tried[:found, 3].argmax()].tolist()
+    assert (
+        any(
+            turn == each and number == agreeing and np.hypot(*(shift - (x, y))) < 1e-3
+            for each, shift, agreeing in plain
+        )
+        or abs(number - most) == 1
+    )
+    assert not lying.any()
+
+
 @given(st.integers(0, 1 << 30), st.floats(-1.0, 1.0), st.floats(-1.0, 1.0), st.floats(-3.0, 3.0))
 def test_a_scan_of_the_place_is_worth_more_than_others(seed, x, y, turn):
     scan = random_scan(seed, 8)

@@ -30,8 +30,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ._jit import kernel
-from .anchors import AnchorPoints, AnchorStack
-from .database import _LEAST_QUALITY, Votes
+from .anchors import AnchorKind, AnchorPoints, AnchorStack
+from .database import _LEAST_QUALITY, Votes, _bits
 
 __all__ = ["DIRECTIONS", "View", "panorama", "reordered", "view", "worth"]
 
@@ -64,11 +64,18 @@ _SHIFT = 5.0
 _AGREEING = 0.2
 _MOST_PAIRS = 48
 _TRIED = 2
+# Shifts lie in cells, so wide that those which agree are in the same or in neighbouring ones;
+# there is one more cell on each side.
+_CELL = 1.01 * _AGREEING
+_CELLS = int(2.0 * _SHIFT / _CELL) + 3
 _MOST_ANCHORS = 20
+_KINDS = len(AnchorKind)
 # A reading is where it is expected within so many metres and so much of its distance.
 _TOLERANCE, _TOLERANCE_SHARE = 0.07, 0.015
 # Agreement is counted in whole readings; the bound is to err on the safe side.
 _SLACK = 1e-3
+# So many readings are asked before it is looked whether the bound is out of reach.
+_BETWEEN = 8
 _PER_PAIR, _PER_VOTE = 0.05, 0.2
 _NO_AGREEMENT = -2.0
 _QUARTERS = ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))
@@ -225,40 +232,52 @@ def _panorama(points, main):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _agrees(x, y, distances):  # type: ignore[no-untyped-def]
-    """1 for a point that ends where a panorama says, -1 for one before it, 0 for others."""
-    at = _direction(x, y)
-    low = distances[at]
-    if low <= 0.0:
-        return 0
-    high = low
-    # Between two directions a wall may be anywhere between what both see.
-    for other in (at + 1 if at + 1 < DIRECTIONS else 0, at - 1 if at > 0 else DIRECTIONS - 1):
-        distance = distances[other]
-        if distance > 0.0:
-            low = min(low, distance)
+def _nearby(distances, lows, highs):  # type: ignore[no-untyped-def]
+    """The nearest and the farthest that each direction and its two neighbours saw.
+
+    Between two directions a wall may be anywhere between what both see.
+    """
+    for at in range(DIRECTIONS):
+        low = high = distances[at]
+        for other in (at + 1 if at + 1 < DIRECTIONS else 0, at - 1 if at > 0 else DIRECTIONS - 1):
+            distance = distances[other]
+            low = min(low, distance) if distance > 0.0 else low
             high = max(high, distance)
-    distance = math.sqrt(x * x + y * y)
-    tolerance = np.float32(_TOLERANCE) + np.float32(_TOLERANCE_SHARE) * distance
-    if distance < low - tolerance:
-        return -1
-    return 1 if distance <= high + tolerance else 0
+        lows[at], highs[at] = low, high
 
 
 @kernel
-def _there(readings, c, s, x, y, distances, needed):  # type: ignore[no-untyped-def]
+def _agrees(x, y, lows, highs):  # type: ignore[no-untyped-def]
+    """1 for a point that ends where a panorama says, -1 for one before it, 0 for others.
+
+    What comes out is anybody's guess, so that nothing branches by it.
+    """
+    at = _direction(x, y)
+    low, high = lows[at], highs[at]
+    distance = math.sqrt(x * x + y * y)
+    tolerance = np.float32(_TOLERANCE) + np.float32(_TOLERANCE_SHARE) * distance
+    seen = int(low > 0.0)
+    return seen * (int(distance <= high + tolerance) - 2 * int(distance < low - tolerance))
+
+
+@kernel
+def _there(readings, c, s, x, y, nearby, needed):  # type: ignore[no-untyped-def]
     """Agreement of the scan's readings with the reference's panorama.
 
     Once less than ``needed`` is sure, it is left at what it would be if no other one agreed;
-    the second value says so.
+    returns whether it was not.
     """
+    lows, highs = nearby
     count = max(len(readings), 1)
     least = needed * count - _SLACK
-    total, left = 0, len(readings)
-    for i in range(len(readings)):
-        px, py = readings[i, 0], readings[i, 1]
-        total += _agrees(c * px - s * py + x, s * px + c * py + y, distances)
-        left -= 1
+    total, asked = 0, 0
+    while asked < len(readings):
+        end = min(asked + _BETWEEN, len(readings))
+        for i in range(asked, end):
+            px, py = readings[i, 0], readings[i, 1]
+            total += _agrees(c * px - s * py + x, s * px + c * py + y, lows, highs)
+        asked = end
+        left = len(readings) - asked
         if total + left < least:
             return (total - left) / count, False
     return total / count, True
@@ -267,65 +286,96 @@ def _there(readings, c, s, x, y, distances, needed):  # type: ignore[no-untyped-
 @kernel
 def _back(distances, c, s, x, y, own, needed):  # type: ignore[no-untyped-def]
     """Agreement of the reference's directions with the scan's panorama, as in ``_there``."""
+    lows, highs = own
     left = 0
     for at in range(0, DIRECTIONS, _EVERY):
         left += distances[at] > 0.0
     count = max(left, 1)
     least = needed * count - _SLACK
     total, at = 0, 0
-    for _ in range(DIRECTIONS // _EVERY):
+    for n in range(DIRECTIONS // _EVERY):
         at = (at + _STRIDE) % DIRECTIONS
         distance = distances[at]
         if distance <= 0.0:
             continue
         px, py = distance * _UNITS[at, 0] - x, distance * _UNITS[at, 1] - y
-        total += _agrees(c * px + s * py, c * py - s * px, own)
+        total += _agrees(c * px + s * py, c * py - s * px, lows, highs)
         left -= 1
-        if total + left < least:
+        if n % _BETWEEN == 0 and total + left < least:
             return (total - left) / count
     return total / count
 
 
 @kernel
-def _shifts(seen, positions, kinds, directions, pairs, tried):  # type: ignore[no-untyped-def]
+def _shifts(seen, turned, positions, directions, starts, pairs, lying, tried):  # type: ignore[no-untyped-def]
     """The shifts between scan and reference that most pairs of anchor points agree on.
 
     Rows of ``tried`` are the quarter turn, the shift, and the pairs that agree; returns how many.
+    ``lying`` says which pairs of a turn lie in each cell, a bit each; all clear between turns.
     """
     counts = np.zeros(4, np.int64)
     for i in range(len(seen.kinds)):
-        for j in range(len(kinds)):
-            if kinds[j] != seen.kinds[i]:
-                continue
+        kind = seen.kinds[i]
+        for j in range(starts[kind], starts[kind + 1]):
             # Directions tell the quarter turn: no pair is alike in two of them.
             off = (directions[j] - seen.directions[i]) * np.float32(2.0 / math.pi)
-            quarters = math.floor(off + np.float32(0.5))
-            turn = int(quarters) & 3
-            if abs(off - quarters) > np.float32(_ALIKE * 2.0 / math.pi):
+            # Rounded: a conversion cuts off what is positive, and costs less than a floor.
+            quarters = np.int32(off + np.float32(64.5)) - np.int32(64)
+            quarter = quarters & 3
+            dx = positions[j, 0] - turned[i, quarter, 0]
+            dy = positions[j, 1] - turned[i, quarter, 1]
+            unlike = abs(off - np.float32(quarters)) > np.float32(_ALIKE * 2.0 / math.pi)
+            if unlike | (dx * dx + dy * dy > np.float32(_SHIFT * _SHIFT)):
                 continue
-            c, s = np.float32(_QUARTERS[turn][0]), np.float32(_QUARTERS[turn][1])
-            dx = positions[j, 0] - (c * seen.positions[i, 0] - s * seen.positions[i, 1])
-            dy = positions[j, 1] - (s * seen.positions[i, 0] + c * seen.positions[i, 1])
-            if dx * dx + dy * dy > np.float32(_SHIFT * _SHIFT) or counts[turn] == _MOST_PAIRS:
+            if counts[quarter] == _MOST_PAIRS:
                 continue
-            pair = pairs[turn, counts[turn]]
-            pair[0], pair[1], pair[2], pair[3] = dx, dy, i, j
-            counts[turn] += 1
+            row = counts[quarter]
+            pairs[quarter, row, 0], pairs[quarter, row, 1] = dx, dy
+            pairs[quarter, row, 2], pairs[quarter, row, 3] = i, j
+            counts[quarter] += 1
     found = 0
     for turn in range(4):
+        if found == _TRIED and tried[found - 1, 3] >= counts[turn]:
+            continue
         for k in range(counts[turn]):
-            if found == _TRIED and tried[found - 1, 3] >= counts[turn]:
-                break
-            found = _noted(pairs[turn], counts[turn], k, turn, tried, found)
+            at = _cell(pairs[turn, k, 0], pairs[turn, k, 1])
+            lying[at] |= np.uint64(1) << np.uint64(k)
+        for k in range(counts[turn]):
+            near = _around(lying, _cell(pairs[turn, k, 0], pairs[turn, k, 1]))
+            # No more can agree than lie near: too few would change neither shift.
+            if found < _TRIED or np.float32(_bits(near)) > min(tried[0, 3], tried[1, 3]):
+                found = _noted(pairs[turn], near, k, turn, tried, found)
+        for k in range(counts[turn]):
+            lying[_cell(pairs[turn, k, 0], pairs[turn, k, 1])] = 0
     return found
 
 
 @kernel
-def _noted(pairs, count, k, turn, tried, found):  # type: ignore[no-untyped-def]
+def _cell(dx, dy):  # type: ignore[no-untyped-def]
+    """Which cell a shift lies in."""
+    u = np.int32((dx + np.float32(_SHIFT)) * np.float32(1.0 / _CELL)) + 1
+    v = np.int32((dy + np.float32(_SHIFT)) * np.float32(1.0 / _CELL)) + 1
+    return u * _CELLS + v
+
+
+@kernel
+def _around(lying, at):  # type: ignore[no-untyped-def]
+    """The pairs in a cell and in those around it, a bit each."""
+    near = np.uint64(0)
+    for row in range(at - _CELLS, at + _CELLS + 1, _CELLS):
+        near |= lying[row - 1] | lying[row] | lying[row + 1]
+    return near
+
+
+@kernel
+def _noted(pairs, near, k, turn, tried, found):  # type: ignore[no-untyped-def]
     """Note the mean shift of the pairs that agree with pair ``k``, each anchor point once."""
     agreeing, x, y = 0, np.float32(0.0), np.float32(0.0)
     had_i, had_j = np.uint64(0), np.uint64(0)
-    for other in range(count):
+    while near != 0:
+        rest = near & (near - np.uint64(1))
+        other = np.int64(_bits((near ^ rest) - np.uint64(1)))
+        near = rest
         dx, dy = pairs[other, 0] - pairs[k, 0], pairs[other, 1] - pairs[k, 1]
         if dx * dx + dy * dy > np.float32(_AGREEING * _AGREEING):
             continue
@@ -360,19 +410,37 @@ def _noted(pairs, count, k, turn, tried, found):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _upright(stack, place, positions, kinds, directions):  # type: ignore[no-untyped-def]
-    """Anchor points of a reference in the frame of its walls; returns how many."""
-    all_positions, all_kinds, all_directions, main_angles, starts = stack
+def _turned(positions):  # type: ignore[no-untyped-def]
+    """Positions in each of the four quarter turns."""
+    turned = np.empty((len(positions), 4, 2), np.float32)
+    for i in range(len(positions)):
+        x, y = positions[i, 0], positions[i, 1]
+        for turn in range(4):
+            turned[i, turn, 0], turned[i, turn, 1] = x, y
+            x, y = -y, x
+    return turned
+
+
+@kernel
+def _upright(stack, place, positions, directions, starts):  # type: ignore[no-untyped-def]
+    """Anchor points of a reference in the frame of its walls, ordered by kind."""
+    all_positions, all_kinds, all_directions, main_angles, begins = stack
     main = main_angles[place] if math.isfinite(main_angles[place]) else 0.0
     c, s = math.cos(main), math.sin(main)
-    count = min(starts[place + 1] - starts[place], _MOST_ANCHORS)
-    for k in range(count):
-        at = starts[place] + k
+    first = begins[place]
+    last = min(begins[place + 1], first + _MOST_ANCHORS)
+    starts[:] = 0
+    for at in range(first, last):
+        starts[all_kinds[at] + 2] += 1
+    for kind in range(2, _KINDS + 2):
+        starts[kind] += starts[kind - 1]
+    # Where the next of each kind goes; in the end that is where the next kind begins.
+    for at in range(first, last):
+        k = starts[all_kinds[at] + 1]
+        starts[all_kinds[at] + 1] += 1
         x, y = all_positions[at, 0], all_positions[at, 1]
         positions[k, 0], positions[k, 1] = c * x + s * y, c * y - s * x
-        kinds[k] = all_kinds[at]
         directions[k] = all_directions[at] - main
-    return count
 
 
 @kernel
@@ -381,16 +449,22 @@ def _worth(seen, stack, panoramas, places, votes, most):  # type: ignore[no-unty
     found = np.empty(len(places))
     best = np.full(max(min(most, len(places)), 1), -np.inf)
     positions = np.empty((_MOST_ANCHORS, 2), np.float32)
-    kinds = np.empty(_MOST_ANCHORS, np.int64)
     directions = np.empty(_MOST_ANCHORS, np.float32)
+    starts = np.empty(_KINDS + 2, np.int64)
+    turned = _turned(seen.positions)
     pairs = np.empty((4, _MOST_PAIRS, 4), np.float32)
+    lying = np.zeros(_CELLS * _CELLS, np.uint64)
     tried = np.empty((_TRIED, 4), np.float32)
     distances = np.empty(DIRECTIONS, np.float32)
+    nearby = (np.empty(DIRECTIONS, np.float32), np.empty(DIRECTIONS, np.float32))
+    own = (np.empty(DIRECTIONS, np.float32), np.empty(DIRECTIONS, np.float32))
+    _nearby(seen.distances, own[0], own[1])
     for k in range(len(places)):
-        count = _upright(stack, places[k], positions, kinds, directions)
-        shifts = _shifts(seen, positions[:count], kinds[:count], directions[:count], pairs, tried)
+        _upright(stack, places[k], positions, directions, starts)
+        shifts = _shifts(seen, turned, positions, directions, starts, pairs, lying, tried)
         for at in range(DIRECTIONS):
             distances[at] = _DISTANCES[panoramas[places[k], at]]
+        _nearby(distances, nearby[0], nearby[1])
         found[k] = _NO_AGREEMENT + votes[k]
         for n in range(shifts):
             quarter = _QUARTERS[int(tried[n, 0])]
@@ -399,13 +473,13 @@ def _worth(seen, stack, panoramas, places, votes, most):  # type: ignore[no-unty
             sure = _PER_PAIR * tried[n, 3] + votes[k]
             # The other way adds one at most: the worst of the best may be out of reach already.
             needed = best[-1] - sure
-            there, complete = _there(seen.readings, c, s, x, y, distances, needed - 1.0)
+            there, complete = _there(seen.readings, c, s, x, y, nearby, needed - 1.0)
             value = sure + there
             if not complete:
                 found[k] = max(found[k], value - 1.0)
                 continue
             needed -= there
-            found[k] = max(found[k], value + _back(distances, c, s, x, y, seen.distances, needed))
+            found[k] = max(found[k], value + _back(distances, c, s, x, y, own, needed))
         if found[k] > best[-1]:
             n = len(best) - 1
             while n > 0 and best[n - 1] < found[k]:
