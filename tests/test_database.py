@@ -149,7 +149,7 @@ def test_spacings_choose_as_plain_comparing_does(count):
     query, own = graphs[0][1], some_spacings(3)
     everything = searched.votes(query)
     score = {
-        k: 0.3 * math.log(q + 1e-6) + plain_likeness(own, saw[k])
+        k: 0.15 * math.log(q + 1e-6) + plain_likeness(own, saw[k])
         for k, q in zip(everything.references.tolist(), everything.quality.tolist(), strict=True)
     }
     for most in (1, 9, 50):

@@ -17,7 +17,7 @@ large merge.  So a reader keeps what it has begun with, and writing costs little
 
 Among very many references the votes leave thousands about as good.  So the database can also hold
 which spacings of walls each one saw (``spacing``): of the references with the largest n_m those
-are taken of which ``0.3 * log(q_m)`` and the likeness of the spacings together are largest.
+are taken of which ``0.15 * log(q_m)`` and the likeness of the spacings together are largest.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ _BINS_OF_ONE = 2048.0
 # References have at most about so many edges; the quality of larger ones takes longer.
 _SIZES = 512
 # Logarithm of the quality and likeness of the spacings choose together.
-_PER_VOTE = 0.3
+_PER_VOTE = 0.15
 _LEAST_QUALITY = 1e-6
 
 Number = TypeVar("Number", np.int32, np.int64, np.uint64)
@@ -88,7 +88,7 @@ class DatabaseSettings(BaseModel):
         description="references of the most votes that the spacings of walls choose these from",
     )
     compared: int = Field(
-        400,
+        800,
         ge=0,
         description="references in a map that are compared by what they saw to choose these",
     )

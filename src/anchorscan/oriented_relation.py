@@ -84,7 +84,7 @@ class OrientedSettings(BaseModel):
         300_000, ge=1, description="database edges looked at; the commonest keys go first"
     )
     most_opening: int = Field(
-        75_000, ge=1, description="the rarest ones; others count for references that these met"
+        120_000, ge=1, description="the rarest ones; others count for references that these met"
     )
 
 

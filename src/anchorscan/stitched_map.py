@@ -461,8 +461,8 @@ def candidates(
         worths: Says what references are worth (``panorama.worth``), by their identifiers and
             q_m, to a view of the scan.
     """
-    compared = settings.database.compared
     found, taken = [], looks(description, settings)
+    compared = settings.database.compared // len(taken)
     for look in taken:
         votes = database.votes(look.graph, max(most, compared), look.spacings, len(taken))
         first = (votes.references[:compared], votes.quality[:compared])
