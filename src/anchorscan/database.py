@@ -83,12 +83,12 @@ class DatabaseSettings(BaseModel):
         None, ge=1, description="references that are followed further; null for all"
     )
     shortlisted: int = Field(
-        8000,
+        4000,
         ge=0,
         description="references of the most votes that the spacings of walls choose these from",
     )
     compared: int = Field(
-        800,
+        600,
         ge=0,
         description="references in a map that are compared by what they saw to choose these",
     )
