@@ -227,8 +227,20 @@ def _metadata(data: bytes, folder: Path) -> None:
     home.mkdir(exist_ok=True)
     (home / "run.db3").touch()
     (home / "metadata.yaml").write_bytes(data)
-    with _kept_storage(None):
+    with _kept_storage(None), _yaml_read_once():
         _check_log(home)
+
+
+@contextlib.contextmanager
+def _yaml_read_once() -> Iterator[None]:
+    """Have rosbags parse a text once, however often it opens the recording."""
+    from rosbags.rosbag2 import reader
+
+    class Once(reader.YAML):  # type: ignore[misc]
+        load = staticmethod(functools.lru_cache(1)(reader.YAML(typ="safe").load))
+
+    with mock.patch.object(reader, "YAML", Once):
+        yield
 
 
 def _message(data: bytes, folder: Path) -> None:
