@@ -70,9 +70,9 @@ def test_an_increment_that_is_no_angle_is_refused(increment):
 def test_a_thinned_scan_has_readings_of_the_first_none_closer_than_asked(
     count, increment, sense, finest
 ):
-    scan = LaserScan(np.arange(count, dtype=np.float32), 0.3, sense * increment)
+    scan = LaserScan(1.0 + np.arange(count, dtype=np.float32) % 7, 0.3, sense * increment)
     thin = scan.thinned(finest)
-    every = max(math.floor(finest / increment + 1e-4), 1)
+    every = max(math.floor(finest / increment + 1e-4), 1) if count else 1
     assert thin.ranges.tolist() == scan.ranges[::every].tolist()
     np.testing.assert_allclose(thin.angles, scan.angles[::every], atol=1e-9)
     assert (thin is scan) == (every == 1)
@@ -83,3 +83,16 @@ def test_a_laser_of_many_readings_still_closes_when_they_are_thinned():
     thin = scan.thinned(math.radians(0.5))
     assert len(thin) == 800
     assert thin.is_full_turn
+
+
+def test_a_scan_of_which_every_other_reading_is_lost_keeps_the_others_when_thinned():
+    ranges = np.where(np.arange(1000) % 2 == 1, 2.0, np.nan)
+    scan = LaserScan(ranges, -1.0, math.radians(0.25))
+    thin = scan.thinned(math.radians(0.5))
+    assert thin.is_return.all()
+    np.testing.assert_allclose(thin.angles, scan.angles[1::2], atol=1e-9)
+
+
+@given(sweeps(), st.floats(0.0, 1.0))
+def test_a_thinned_scan_has_a_return_where_the_scan_has_one(scan, finest):
+    assert scan.thinned(finest).is_return.any() == scan.is_return.any()

@@ -112,14 +112,22 @@ class LaserScan:
             increment: Smallest angle between readings that are left, radians.
 
         Returns:
-            The first reading and every n-th from there; the scan itself where none is left out.
+            Every n-th reading, beginning where most of them are returns; the scan itself where
+            none is left out.
         """
         # Half of a quarter of a degree may be a hair's breadth less than that.
         every = int(1.000001 * increment / (abs(self.angle_increment) or math.inf))
-        if every < 2:
+        if every < 2 or not len(self.ranges):
             return self
-        step = every * self.angle_increment
-        return LaserScan(self.ranges[::every], self.angle_min, step, self.range_min, self.range_max)
+        begins = range(min(every, len(self.ranges)))
+        begin = max(begins, key=lambda k: np.count_nonzero(self.is_return[k::every]))
+        return LaserScan(
+            self.ranges[begin::every],
+            self.angle_min + begin * self.angle_increment,
+            every * self.angle_increment,
+            self.range_min,
+            self.range_max,
+        )
 
     @cached_property
     def angles(self) -> NDArray[np.float64]:
