@@ -467,6 +467,26 @@ def _with_room(values: NDArray[Number], slot: int) -> NDArray[Number]:
 
 
 @kernel
+def _upper(scale, reached, most):  # type: ignore[no-untyped-def]
+    """Places of the ``most`` highest values, and of all in the bin where so many are reached.
+
+    ``scale`` is the bin of each value, negative for those that do not count; ``reached`` says how
+    many lie in each bin.
+    """
+    least, enough = _BINS, 0
+    while least > 0 and enough < most:
+        least -= 1
+        enough += reached[least]
+    chosen = np.empty(enough, np.int64)
+    found = 0
+    for k in range(len(scale)):
+        if scale[k] >= least:
+            chosen[found] = k
+            found += 1
+    return chosen
+
+
+@kernel
 def _frequent(counts, most):  # type: ignore[no-untyped-def]
     """Places of the ``most`` largest counts, and of some that are about as large.
 
@@ -475,21 +495,13 @@ def _frequent(counts, most):  # type: ignore[no-untyped-def]
     highest = np.float32(1e-9)
     for k in range(len(counts)):
         highest = max(highest, counts[k])
-    scale = np.float32(_BINS - 1) / highest
+    unit = np.float32(_BINS - 1) / highest
+    scale = np.empty(len(counts), np.int32)
     reached = np.zeros(_BINS, np.int64)
     for k in range(len(counts)):
-        reached[int(counts[k] * scale)] += 1
-    least, enough = _BINS, 0
-    while least > 0 and enough < most:
-        least -= 1
-        enough += reached[least]
-    chosen = np.empty(enough, np.int64)
-    found = 0
-    for k in range(len(counts)):
-        if int(counts[k] * scale) >= least:
-            chosen[found] = k
-            found += 1
-    return chosen
+        scale[k] = int(counts[k] * unit)
+        reached[scale[k]] += 1
+    return _upper(scale, reached, most)
 
 
 @kernel
@@ -516,14 +528,4 @@ def _promising(slots, counts, sizes, edges, most):  # type: ignore[no-untyped-de
             root = counts[k] * _BINS_OF_ONE / math.sqrt(_pairs(size, edges))
         scale[k] = min(int(root), _BINS - 1)
         reached[scale[k]] += 1
-    least, enough = _BINS, 0
-    while least > 0 and enough < most:
-        least -= 1
-        enough += reached[least]
-    chosen = np.empty(enough, np.int64)
-    found = 0
-    for k in range(len(slots)):
-        if scale[k] >= least:
-            chosen[found] = k
-            found += 1
-    return chosen[:found]
+    return _upper(scale, reached, most)

@@ -193,9 +193,7 @@ def compare(trace: Trace, hypothesis: Hypothesis) -> Comparison:
     if evaluation.overview == "reference":
         front, T_reference_front = trace.description.scan, hypothesis.pose_in_reference
     else:
-        finest = trace.settings.anchors.finest_increment
-        front = trace.reference(hypothesis.reference).scan.thinned(finest)
-        T_reference_front = Pose2D()
+        front, T_reference_front = trace.reference_scan(hypothesis), Pose2D()
     seen = front.ranges.astype(np.float64)
     made = evaluation.synthetic.ranges.astype(np.float64)
     rule = trace.settings.evaluation

@@ -52,7 +52,7 @@ from .settings import Settings
 from .simulator import SensorModel, random_building, random_poses, simulate
 from .spacing import spacings
 from .stitched_map import candidates
-from .verification import readings, verify
+from .verification import verify
 
 __all__ = ["RANKS", "SIZES", "Growth", "Place", "Scene", "Size", "distractors", "measure", "slope"]
 
@@ -311,7 +311,7 @@ class _Asked:
         self.described = [describe(scan, settings) for scan, _ in self.queries]
         self.seen = _Seen(
             stack_anchors([known.anchors for known in self.known]),
-            np.array([panorama(d.angles.points, d.anchors.main_angle) for d in self.known]),
+            np.array([panorama(d.points, d.anchors.main_angle) for d in self.known]),
             np.empty(0, np.int32),
         )
         scans = ((each.scan, _pose(each)) for each in place.references)
@@ -334,7 +334,7 @@ class _Asked:
         if not some:
             return False
         settings = self.settings
-        seen = readings(description.angles, settings.verification)
+        seen = description.readings
         related = joined([self._landmarks[number] for number in some])
         proposed = proposals(description.anchors, seen, related, self._tiles, settings.proposal)
         fits = verify(proposed.poses, seen, self._tiles, self._weights, settings.verification)
@@ -372,7 +372,7 @@ def _scene(building: str, description: Description) -> Scene:
     c, s = math.cos(main), math.sin(main)
     upright = np.array([[c, -s], [s, c]])
     turned = AnchorPoints(anchors.positions @ upright, anchors.kinds, anchors.directions - main, 0)
-    return Scene(building, turned, description.angles.points @ upright)
+    return Scene(building, turned, description.points @ upright)
 
 
 def distractors(pool: Sequence[Scene], count: int, seed: int) -> Iterator[tuple[int, Scene]]:

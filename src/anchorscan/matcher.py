@@ -66,16 +66,24 @@ class Trace:
                 return reference
         raise ValueError(f"no hypothesis of this scan names reference {identifier}")
 
+    def reference_scan(self, hypothesis: Hypothesis) -> LaserScan:
+        """Return the scan of a hypothesis' reference as it is looked at, thinned where it is dense.
+
+        Raises:
+            ValueError: The hypothesis is not one of this trace.
+        """
+        scan = self.reference(hypothesis.reference).scan
+        return scan.thinned(self.settings.anchors.finest_increment)
+
     def evaluation(self, hypothesis: Hypothesis) -> Evaluation:
         """Evaluate one of the hypotheses once more and keep its synthetic scan.
 
         Raises:
             ValueError: The hypothesis is not one of this trace.
         """
-        finest = self.settings.anchors.finest_increment
         return evaluate(
             self.description.scan,
-            self.reference(hypothesis.reference).scan.thinned(finest),
+            self.reference_scan(hypothesis),
             hypothesis.pose_in_reference,
             self.settings.evaluation,
             self.settings.anchors.angle_function,

@@ -375,7 +375,7 @@ def _passing(
 ) -> Proposals:
     """Those of the first poses, with headings in 65,536ths of a turn, that pass the first check."""
     sieve = (settings.readings, settings.most)
-    poses, scores = _passed(points, tiles, out, found, sieve)
+    poses, scores = _checked(points, tiles, out, found, sieve)
     return Proposals(poses, scores, found)
 
 
@@ -589,8 +589,10 @@ def _lone_proposals(query, known, limits, out, found):  # type: ignore[no-untype
 
 
 @kernel
-def _checked(chosen, tiles, out, found, most):  # type: ignore[no-untyped-def]
-    """Drop what was proposed before, check the others, and keep the best."""
+def _checked(points, tiles, out, found, sieve):  # type: ignore[no-untyped-def]
+    """Drop what was proposed before, check the others by some readings, and keep the best."""
+    count, most = sieve
+    chosen = spread(on_large(points), count)
     table = _rotated(chosen, tiles)
     slots = 64
     while slots < 2 * found:
@@ -637,9 +639,3 @@ def _highest(poses, scores, full, most):  # type: ignore[no-untyped-def]
         values[taken] = scores[k] / full
         taken += 1
     return best, values
-
-
-@kernel
-def _passed(readings, tiles, out, found, sieve):  # type: ignore[no-untyped-def]
-    """The best of the first ``found`` poses by some readings on large things."""
-    return _checked(spread(on_large(readings), sieve[0]), tiles, out, found, sieve[1])

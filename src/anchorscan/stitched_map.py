@@ -462,10 +462,10 @@ def candidates(
             q_m, to a view of the scan.
     """
     found, taken = [], looks(description, settings)
-    compared = settings.database.compared // len(taken)
+    few = settings.database.compared // len(taken)
     for look in taken:
-        votes = database.votes(look.graph, max(most, compared), look.spacings, len(taken))
-        first = (votes.references[:compared], votes.quality[:compared])
+        votes = database.votes(look.graph, max(most, few), look.spacings, len(taken))
+        first = (votes.references[:few], votes.quality[:few])
         found.append((votes, worths(look.view, *first)))
     return reordered(found, most)
 
