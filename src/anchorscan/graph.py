@@ -23,6 +23,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from ._jit import kernel
 from .anchors import AnchorPoints
+from .ranking import ascending
 
 __all__ = ["AnchorGraph", "GraphSettings", "GraphStack", "anchor_graph", "stack"]
 
@@ -150,7 +151,7 @@ def _edges(positions, limits):  # type: ignore[no-untyped-def]
                 nodes[found, 1] = b
                 lengths[found] = length
                 found += 1
-    order = np.argsort(lengths[:found], kind="mergesort")
+    order = ascending(lengths[:found])
     return nodes[:found][order], lengths[:found][order]
 
 

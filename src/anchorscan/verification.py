@@ -68,6 +68,9 @@ class VerificationSettings(BaseModel):
     third_readings: int = Field(80, ge=4, description="readings of the third check")
     third_poses: int = Field(25, ge=1, description="poses that reach the third check")
     fits: int = Field(7, ge=1, description="distinct poses that are refined")
+    fit_margin: float = Field(
+        0.3, gt=0.0, description="third scores less than the best by more are no rivals"
+    )
     fit_readings: int = Field(72, ge=4, description="readings of the refinement")
     iterations: int = Field(6, ge=0, description="steps of the refinement")
     follow_iterations: int = Field(
@@ -170,8 +173,8 @@ def verify(
         settings.third_readings,
         settings.third_poses,
         settings.fits,
-        settings.distinct_distance,
-        settings.distinct_turn,
+        settings.fit_margin,
+        (settings.distinct_distance, settings.distinct_turn),
     )
     chosen = _sieve(poses, seen, tiles, weights, sieves)
     places = (settings.place_distance, settings.place_turn)
@@ -244,13 +247,18 @@ def worth(score, through):  # type: ignore[no-untyped-def]
 
 @kernel
 def _sieve(poses, readings, tiles, weights, sieves):  # type: ignore[no-untyped-def]
-    """The best distinct poses by more and more readings."""
-    second, third, most, fits, distance, turn = sieves
+    """The best distinct poses by more and more readings, at least two where there are."""
+    second, third, most, fits, margin, apart = sieves
     scores = field_scores(poses, spread(readings, second), tiles, weights)
     best = poses[best_first(scores, most)]
     scores = field_scores(best, spread(readings, third), tiles, weights)
-    best = best[best_first(scores, most)]
-    return best[_distinct(best, distance, turn, fits)]
+    order = best_first(scores, most)
+    best = best[order]
+    chosen = _distinct(best, apart[0], apart[1], fits)
+    left = len(chosen)
+    while left > 2 and scores[order[chosen[left - 1]]] < scores[order[0]] - margin:
+        left -= 1
+    return best[chosen[:left]]
 
 
 @kernel
