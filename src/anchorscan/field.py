@@ -25,6 +25,7 @@ from __future__ import annotations
 import math
 import threading
 from collections.abc import Iterable, Iterator
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -324,6 +325,13 @@ class LikelihoodField:
         """Cells within ``reach``."""
         return math.ceil(self._settings.reach / self._settings.resolution)
 
+    @cached_property
+    def _near(self) -> NDArray[np.int64]:
+        """(K, 2) steps to the squares within ``reach`` of one."""
+        wide = -(-self._halo // _SIDE)
+        steps = np.arange(-wide, wide + 1)
+        return np.stack(np.meshgrid(steps, steps, indexing="ij"), axis=-1).reshape(-1, 2)
+
     def _deposit(self, rays: _Rays, sign: int) -> tuple[NDArray[np.int64], NDArray[np.uint64]]:
         """Change the evidence of rays.
 
@@ -390,10 +398,7 @@ class LikelihoodField:
 
     def _around(self, squares: NDArray[np.int64]) -> NDArray[np.int64]:
         """Squares with those within reach of them, one behind the other."""
-        wide = -(-self._halo // _SIDE)
-        steps = np.arange(-wide, wide + 1)
-        near = np.stack(np.meshgrid(steps, steps, indexing="ij"), axis=-1).reshape(-1, 2)
-        return (squares[:, np.newaxis] + near).reshape(-1, 2)
+        return (squares[:, np.newaxis] + self._near).reshape(-1, 2)
 
     def _renewed(self, squares: NDArray[np.int64]) -> NDArray[np.int32]:
         """Give squares tiles that nobody reads yet, with what theirs held before."""
