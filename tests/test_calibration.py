@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -29,9 +30,8 @@ def drawn(building, count, seed, coefficients=TRUE):
         )
     )
     probability = 1.0 / (1.0 + np.exp(-(numbers @ coefficients)))
-    return Sample(
-        "P1", building, (building, building), 0.0, numbers, rng.random(count) < probability
-    )
+    right = rng.random(count) < probability
+    return Sample("P1", building, (building, building), 0.0, numbers, np.ones(count), right)
 
 
 def test_the_fit_finds_the_coefficients_that_made_the_samples():
@@ -51,7 +51,7 @@ def test_a_building_is_scored_by_the_others_alone():
 
 def test_separable_samples_do_not_run_away():
     sample = drawn("a", 200, 5)
-    clear = Sample("P1", "a", ("a", "a"), 0.0, sample.evidence, sample.evidence[:, 2] > 2.0)
+    clear = replace(sample, correct=sample.evidence[:, 2] > 2.0)
     assert all(math.isfinite(value) and abs(value) < 1e3 for value in weigh([clear]).values())
 
 

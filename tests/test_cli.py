@@ -125,10 +125,11 @@ def test_a_log_becomes_a_set_and_its_scans_find_their_places(
     right = 0
     for line, record in zip(located.lines, records, strict=True):
         assert record.pose is not None
-        assert {"scan", "stamp", "seconds", "accepted", "hypotheses"} <= line.keys()
+        assert {"scan", "stamp", "seconds", "accepted", "state", "hypotheses"} <= line.keys()
         assert line["stamp"] == pytest.approx(record.stamp)
         assert 0.0 < line["seconds"] < 60.0
         assert all(each.keys() >= HYPOTHESIS_KEYS for each in line["hypotheses"])
+        assert line["state"] == ("located" if line["accepted"] else "unknown")
         best = line["hypotheses"][0]
         assert all(0.0 <= best[name] <= 1.0 for name in ("evaluation", "probability"))
         covariance = best["covariance"]

@@ -177,6 +177,35 @@ def test_a_scan_that_one_place_explains_is_an_answer_and_one_that_two_do_is_none
 
 
 @PRESETS
+def test_places_that_explain_a_scan_alike_are_counted(preset: DecisionSettings) -> None:
+    def alike(*scores: float) -> int:
+        return decide(fits_of(list(scores)), MANY, preset).alike
+
+    assert alike(0.95, 0.45) == 1
+    assert alike(0.95, 0.95, 0.45) == 2
+    assert alike(0.95, 0.95, 0.95, 0.45) == 3
+    assert alike(0.95, 0.95, 0.95, 0.95, 0.45) == 0  # more than can be told
+    assert alike(0.95, 0.95) == 2  # and nothing else
+    assert alike(0.3, 0.3, 0.1) == 0  # alike, and neither explains much
+
+
+@PRESETS
+@given(scores=scores_of_fits, through=shares, anchors=st.integers(0, 60))
+def test_without_the_others_the_best_of_places_alike_is_an_answer(
+    preset: DecisionSettings, scores: list[float], through: float, anchors: int
+) -> None:
+    def without(others: int) -> bool:
+        return decide(
+            fits_of([scores[0], *scores[1 + others :]], through), anchors, preset
+        ).accepted
+
+    decision = decide(fits_of(scores, through), anchors, preset)
+    most = min(len(scores), preset.most_alike)
+    answers = [others + 1 for others in range(most) if without(others)]
+    assert decision.alike == (answers[0] if answers else 0)
+
+
+@PRESETS
 def test_a_single_fit_stands_for_itself(preset: DecisionSettings) -> None:
     alone = decide(fits_of([0.9]), MANY, preset)
     assert alone.probabilities.shape == (1,)

@@ -119,6 +119,11 @@ def test_a_twin_in_another_building_silences_the_answer(
         assert not one.accepted
         assert one.probability >= two.probability
         assert one.probability < 0.96
+        # Where one building would be enough for an answer, both are told.
+        first, second = (each.building for each in doubled.locate(record.scan)[:2])
+        if alone.locate(record.scan)[0].hypothesis.accepted and {first, second} == {"b11", "twin"}:
+            assert one.ambiguous
+            assert two.ambiguous
     assert alone.locate(record.scan)[0].hypothesis.accepted
 
 

@@ -20,6 +20,7 @@ from anchorscan import (
     match,
     random_building,
     simulate,
+    state_of,
 )
 from anchorscan.simulator import random_poses
 
@@ -62,6 +63,31 @@ def test_a_scan_located_against_itself_is_where_it_was_taken(seed):
         # e_m cannot tell a perfect look-alike from the place itself: both are best then.
         best = [each.pose for each in hypotheses if each.evaluation == 1.0]
         assert any(pose.distance(place) < 2e-3 and pose.turn(place) < 1e-3 for pose in best)
+
+
+def test_of_two_places_alike_both_are_told():
+    world, places, scans = building(4)
+    away = Pose2D(100.0, -40.0, 0.5)
+    twins = [*references_of(places, scans)]
+    twins += [
+        Reference(len(twins) + k, each.scan, away @ each.pose) for k, each in enumerate(twins)
+    ]
+    once, twice = Matcher(twins[: len(places)]), Matcher(twins)
+    seen = 0
+    for place in places:
+        there = place @ Pose2D(0.3, 0.1, 0.2)
+        scan = simulate(world, there, SENSOR, np.random.default_rng(1))
+        located, hypotheses = once.locate(scan), twice.locate(scan)
+        assert not hypotheses[0].accepted
+        assert not any(each.ambiguous for each in located if located[0].accepted)
+        if state_of(located) == "located":
+            seen += 1
+            assert state_of(hypotheses) == "ambiguous"
+            first, second = (each for each in hypotheses if each.ambiguous)
+            shifted = sorted((first.pose, second.pose), key=lambda pose: pose.x)
+            assert shifted[0].distance(there) < 0.3
+            assert shifted[1].distance(away @ there) < 0.3
+    assert seen >= 4
 
 
 @settings(deadline=None, max_examples=20)

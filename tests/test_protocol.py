@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -294,6 +295,16 @@ def test_figures_by_hand():
     assert result.position_median == pytest.approx(0.25)
     # Squared errors of 1 and 16 against a bound of 7.81.
     assert result.honest_covariance == 0.5
+
+
+def test_an_ambiguous_answer_names_the_right_place_or_does_not():
+    far, near = Pose2D(9.0, 0, 0), Pose2D(0.1, 0, 0)
+    unsure = [
+        replace(answer(best, 0.5, accepted=False), others=others)
+        for best, others in ((near, (far,)), (far, (far, near)), (far, (far,)), (near, ()))
+    ]
+    result = figures(unsure)
+    assert (result.silent, result.ambiguous, result.named) == (4, 3, 2)
 
 
 def test_figures_of_nothing_are_refused():

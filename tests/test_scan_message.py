@@ -84,10 +84,19 @@ def test_special_ranges_are_spelled() -> None:
 
 def test_a_hypothesis_comes_back_as_it_was() -> None:
     one = Hypothesis(
-        3, Pose2D(0.1, 0.2, 0.3), None, np.eye(3) / 3.0, 1 / 3, math.nan, 0.7, 0.123456789, True
+        3,
+        Pose2D(0.1, 0.2, 0.3),
+        None,
+        np.eye(3) / 3.0,
+        1 / 3,
+        math.nan,
+        0.7,
+        0.123456789,
+        True,
+        True,
     )
     back = hypothesis_of(json.loads(json.dumps(hypothesis_values(one), allow_nan=False)))
-    assert (back.reference, back.pose, back.accepted) == (3, None, True)
+    assert (back.reference, back.pose, back.accepted, back.ambiguous) == (3, None, True, True)
     assert back.pose_in_reference == one.pose_in_reference
     assert (back.probability, back.evaluation) == (one.probability, one.evaluation)
     assert np.array_equal(back.covariance, one.covariance)

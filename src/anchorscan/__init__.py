@@ -21,6 +21,7 @@ if TYPE_CHECKING:  # what type checkers and editors see; a test holds it equal t
     from .fleet import BuildingHypothesis as BuildingHypothesis
     from .fleet import Fleet as Fleet
     from .hypothesis import Hypothesis as Hypothesis
+    from .hypothesis import state_of as state_of
     from .io import Log as Log
     from .io import Problem as Problem
     from .io import open_log as open_log
@@ -87,6 +88,7 @@ _HOMES = {
     "random_building": "building",
     "reference_scans": "occupancy",
     "simulate": "simulator",
+    "state_of": "hypothesis",
     "stitch": "occupancy",
     "write_map": "map_file",
     "write_tum": "io",

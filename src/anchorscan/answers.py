@@ -49,6 +49,7 @@ class Guess:
         evaluation: e_m of section 5, NaN where it was not written.
         quality: q_m of section 4.1, NaN where it was not written.
         score: What the hypotheses were ordered by, NaN where it was not written.
+        ambiguous: Whether it is one of several places that explain the scan alike.
     """
 
     pose: Pose2D | None
@@ -59,6 +60,7 @@ class Guess:
     evaluation: float = math.nan
     quality: float = math.nan
     score: float = math.nan
+    ambiguous: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,6 +104,7 @@ class ScanAnswer:
                 each.evaluation,
                 each.quality,
                 each.score,
+                each.ambiguous,
             )
             for each in hypotheses
         )
@@ -228,6 +231,7 @@ def _guess(values: Mapping[str, Any]) -> Guess:
         evaluation=_number(values, "evaluation"),
         quality=_number(values, "quality"),
         score=_number(values, "score"),
+        ambiguous=bool(values.get("ambiguous", False)),
     )
 
 

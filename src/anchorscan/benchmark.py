@@ -37,6 +37,7 @@ from . import __version__
 from .cluster import Spread
 from .errors import AnchorscanError, LogError, MissingExtraError
 from .exhaustive_search import ExhaustiveSearch
+from .hypothesis import Hypothesis
 from .io import open_log
 from .karto_matcher import KartoMatcher
 from .matcher import Matcher
@@ -625,7 +626,22 @@ def _ask(task: Task, locate: Locate, position: int) -> Answer:
     covariance = None
     if known and best.covariance is not None:
         covariance = best.covariance + _truth_covariance(task.asked)
-    return Answer(position, best.pose, truth, best.probability, best.accepted, seconds, covariance)
+    return Answer(
+        position,
+        best.pose,
+        truth,
+        best.probability,
+        best.accepted,
+        seconds,
+        covariance,
+        _others(found),
+    )
+
+
+def _others(found: Sequence[Answering]) -> tuple[Pose2D, ...]:
+    """Poses of the places that explain an ambiguous scan as the best one does."""
+    alike = [each.pose for each in found if isinstance(each, Hypothesis) and each.ambiguous]
+    return tuple(pose for pose in alike[1:] if pose is not None)
 
 
 def _truth_covariance(drive: Drive) -> NDArray[np.float64]:

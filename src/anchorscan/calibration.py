@@ -21,7 +21,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .decision import evidence
+from .decision import beside, evidence
 from .matcher import Matcher
 from .pose import Pose2D
 from .protocol import Case, is_correct, recall_at_precision, reliability
@@ -48,6 +48,7 @@ class Sample:
         buildings: Of the references and of the queries.
         crowd: Share of the readings that people occlude.
         evidence: (N, 6) of the best fit of each query.
+        most: (N,) that the decision lets it be worth beside the others.
         correct: (N,) whether that fit was right.
     """
 
@@ -56,6 +57,7 @@ class Sample:
     buildings: tuple[str, ...]
     crowd: float
     evidence: NDArray[np.float64]
+    most: NDArray[np.float64]
     correct: NDArray[np.bool_]
 
 
@@ -103,28 +105,29 @@ def gather(
         asked = list(case.queries)
         asked = asked[:: max(1, len(asked) // queries)]
         for crowd in _CROWDS:
-            rows, correct = _asked(matcher, asked, crowd)
+            rows, most, correct = _asked(matcher, asked, crowd)
             say(
                 f"{case.protocol} {case.place}, {crowd:.0%} occluded: {sum(correct)} of {len(rows)}"
             )
             if len(rows):
-                sample = Sample(case.protocol, case.place, case.buildings, crowd, rows, correct)
-                samples.append(sample)
+                told = (rows, most, correct)
+                samples.append(Sample(case.protocol, case.place, case.buildings, crowd, *told))
     return samples
 
 
 def _asked(
     matcher: Matcher, asked: Sequence[tuple[LaserScan, Pose2D | None]], crowd: float
-) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Evidence of the best fits of scans in a crowd, and whether they are right."""
-    rows, right = [], []
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
+    """Evidence of the best fits of scans in a crowd, the most they can be worth, and if right."""
+    rows, most, right = [], [], []
     for seed, (scan, truth) in enumerate(asked):
         trace = matcher.explain(occlude(scan, crowd, seed) if crowd else scan)
         search = trace.in_map
         if search is not None and len(search.fits):
             rows.append(evidence(search.fits, len(trace.description.anchors)))
+            most.append(beside(search.fits, matcher.settings.decision))
             right.append(is_correct(Pose2D.from_array(search.fits.poses[0]), truth))
-    return np.array(rows), np.array(right, bool)
+    return np.array(rows), np.array(most), np.array(right, bool)
 
 
 def weigh(samples: Sequence[Sample]) -> dict[str, float]:
@@ -145,6 +148,7 @@ def rotate(samples: Sequence[Sample], threshold: float) -> list[Fit]:
 def fit(sample: Sample, coefficients: NDArray[np.float64], threshold: float) -> Fit:
     """Score one sample by given coefficients."""
     probability = 1.0 / (1.0 + np.exp(-(sample.evidence @ coefficients)))
+    probability = np.minimum(probability, sample.most)
     accepted = probability >= threshold
     return Fit(
         sample.protocol,

@@ -26,6 +26,21 @@ much of the pose's covariance lies within what counts as correct.  On the develo
 neither changes an answer, since what was answered there is held to 9 cm in 99 of 100 cases;
 without them a scan with a single reading is an answer.
 
+**Twins.**  Two places may be the same: rooms of one hotel, or one building in two sets.  Whichever
+is right, how much of the scan they explain differs only by how the map's grid happens to lie, by
+``twins`` in the root mean square (``anchorscan bench-fleet`` measures it on buildings and their
+copies).  A logistic of logarithms does not see that where nearly all is explained, and the
+evidence it was fitted to has no twins.  So the probability is held to at most
+
+    1 - exp(-(m / twins)^2 / 2) / 2
+
+with the score's margin ``m`` to the highest of any other place, whatever rays see through there:
+doors are opened and walls taken away.
+
+Where two or three places explain a scan alike, none is an answer, and to say "not known" would
+keep something back: it is at one of them.  Such a scan is *ambiguous*: without the other places
+the best would be an answer.  They are left out one by one, best first, until it is.
+
 What is left goes to the other fits and to "somewhere else", in proportion to
 ``exp(rivalry * worth)``; "somewhere else" competes with a fixed score.  No fit gets more than
 the best: what that would be is "somewhere else", too.
@@ -48,7 +63,15 @@ from ._jit import kernel
 from .covariance import held, inverses
 from .verification import FEATURES, LARGEST_SCORE, Fits, worth
 
-__all__ = ["Decision", "DecisionSettings", "covariance", "decide", "evidence", "worths"]
+__all__ = [
+    "Decision",
+    "DecisionSettings",
+    "beside",
+    "covariance",
+    "decide",
+    "evidence",
+    "worths",
+]
 
 _SCORE, _THROUGH = FEATURES.index("score"), FEATURES.index("through")
 _SMALLEST_MARGIN = 0.003
@@ -77,6 +100,10 @@ class DecisionSettings(BaseModel):
     readings_alike: float = Field(
         1.8, ge=1.0, description="readings that err together: so many count as one"
     )
+    twins: float = Field(
+        0.018, gt=0.0, description="how far the scores of equal places lie apart, root mean square"
+    )
+    most_alike: int = Field(3, ge=1, description="places that an ambiguous answer names at most")
     widest_deviation: float = Field(
         5.0, gt=0.0, description="standard deviation where nothing holds the pose, metres, radians"
     )
@@ -101,12 +128,19 @@ class Decision:
     Args:
         probabilities: (F,) that each fit is right.
         elsewhere: Probability that none is.
-        accepted: Whether the first is an answer.
+        alike: How many of the first fits explain the scan alike, so that it was taken at one of
+            them: 1 where the first is an answer, 2 or more where it is ambiguous, 0 where
+            nothing is known.
     """
 
     probabilities: NDArray[np.float64]
     elsewhere: float
-    accepted: bool
+    alike: int
+
+    @property
+    def accepted(self) -> bool:
+        """Whether the first is an answer."""
+        return self.alike == 1
 
 
 def evidence(fits: Fits, anchors: int) -> NDArray[np.float64]:
@@ -118,18 +152,19 @@ def evidence(fits: Fits, anchors: int) -> NDArray[np.float64]:
         fits: At least one.
         anchors: How many anchor points the scan has.
     """
-    numbers: NDArray[np.float64] = _evidence(
-        fits.features, fits.hessians[0, 2, 2], fits.readings, anchors
-    )
+    counts = (fits.readings, anchors)
+    numbers: NDArray[np.float64] = _evidence(fits.features, 1, fits.hessians[0, 2, 2], counts)
     return numbers
 
 
 @kernel
-def _evidence(features, heading, readings, anchors):  # type: ignore[no-untyped-def]
+def _evidence(features, second, heading, counts):  # type: ignore[no-untyped-def]
+    """What speaks for the best fit against that of rank ``second`` and those behind it."""
+    readings, anchors = counts
     score, through = features[0, _SCORE], features[0, _THROUGH]
     rival = worth(0.5 * score, 0.0)
-    if len(features) > 1:
-        rival = worth(features[1, _SCORE], features[1, _THROUGH])
+    if len(features) > second:
+        rival = worth(features[second, _SCORE], features[second, _THROUGH])
     margin = max(worth(score, through) - rival, _SMALLEST_MARGIN)
     rest = 1.0 - min(score, LARGEST_SCORE)
     rest += _LUCKY_READINGS * max(0.0, 1.0 / max(readings, 1) - 1.0 / _MANY_READINGS)
@@ -186,8 +221,8 @@ def decide(fits: Fits, anchors: int, settings: DecisionSettings) -> Decision:
         settings: Of the decision.
     """
     if not len(fits):
-        return Decision(np.empty(0), 1.0, False)
-    best, probabilities, elsewhere = _decided(
+        return Decision(np.empty(0), 1.0, 0)
+    probabilities, elsewhere, alike = _decided(
         fits.features,
         fits.hessians,
         fits.residuals,
@@ -195,21 +230,54 @@ def decide(fits: Fits, anchors: int, settings: DecisionSettings) -> Decision:
         settings.weights,
         _deviations(settings),
         (settings.elsewhere, settings.rivalry),
+        (settings.threshold, settings.most_alike, settings.twins),
     )
-    return Decision(probabilities, elsewhere, best >= settings.threshold)
+    return Decision(probabilities, elsewhere, alike)
 
 
 @kernel
-def _decided(features, hessians, residuals, counts, weights, deviations, others):  # type: ignore[no-untyped-def]
-    """Probability of the best fit, of each, and of none of them."""
-    numbers = _evidence(features, hessians[0, 2, 2], counts[0], counts[1])
+def _decided(features, hessians, residuals, counts, weights, deviations, others, answer):  # type: ignore[no-untyped-def]
+    """Probability of each fit, of none of them, and how many of the first are alike."""
+    heading = hessians[0, 2, 2]
+    known = held(_covariances(hessians[:1], residuals[:1], deviations)[0])
+    threshold, most, twins = answer
+    best = known * _place(_evidence(features, 1, heading, counts), weights)
+    best = min(best, _beside(features, 1, twins))
+    shared, elsewhere = _shared(best, _worths(features), worth(others[0], 0.0), others[1])
+    alone, alike = best, 1
+    while alone < threshold and alike < min(most, len(features)):
+        alike += 1
+        alone = known * _place(_evidence(features, alike, heading, counts), weights)
+        alone = min(alone, _beside(features, alike, twins))
+    return shared, elsewhere, alike if alone >= threshold else 0
+
+
+@kernel
+def _beside(features, second, twins):  # type: ignore[no-untyped-def]
+    """The most that the best fit can be worth beside those from rank ``second`` on."""
+    margin = np.inf
+    for k in range(second, len(features)):
+        margin = min(margin, max(features[0, _SCORE] - features[k, _SCORE], 0.0))
+    return 1.0 - 0.5 * math.exp(-0.5 * (margin / twins) ** 2)
+
+
+def beside(fits: Fits, settings: DecisionSettings) -> float:
+    """Return the most that the best fit can be worth beside the others, one of which may be a twin.
+
+    Args:
+        fits: At least one.
+        settings: Of the decision.
+    """
+    return float(_beside(fits.features, 1, settings.twins))
+
+
+@kernel
+def _place(numbers, weights):  # type: ignore[no-untyped-def]
+    """Probability of the right place: the logistic function, which takes any value."""
     log_odds = 0.0
     for k in range(len(numbers)):
         log_odds += numbers[k] * weights[k]
-    place = 0.5 * (1.0 + math.tanh(0.5 * log_odds))  # the logistic function of any value
-    best = place * held(_covariances(hessians[:1], residuals[:1], deviations)[0])
-    shared, elsewhere = _shared(best, _worths(features), worth(others[0], 0.0), others[1])
-    return best, shared, elsewhere
+    return 0.5 * (1.0 + math.tanh(0.5 * log_odds))
 
 
 def worths(fits: Fits) -> NDArray[np.float64]:

@@ -50,6 +50,7 @@ from .explanation import (
     picture_of_map,
     wall_points,
 )
+from .hypothesis import state_of
 from .pose import Pose2D
 from .scan import LaserScan
 from .stitched_map import MapSearch
@@ -688,7 +689,7 @@ def _plot_worth(axes: Axes, search: MapSearch, theme: Theme) -> None:
     axes.set_xlim(0.0, 1.45)
     axes.set_xticks([0.0, 0.5, 1.0])
     axes.set_xlabel("score of the fit")
-    verdict = "accepted" if search.decision.accepted else "“not known”"
+    verdict = {0: "“not known”", 1: "accepted"}.get(search.decision.alike, "ambiguous")
     axes.set_title(f"{verdict}\np elsewhere = {search.decision.elsewhere:.3f}")
 
 
@@ -758,9 +759,15 @@ def _plot_truth(axes: Axes, explanation: Explanation, theme: Theme) -> None:
         axes.plot(x, y, "o", ms=17, mfc="none", mec=theme.angle, mew=2.0, zorder=7)
 
 
+_VERDICTS = {
+    "located": "accepted",
+    "ambiguous": "one of several alike",
+    "unknown": "not accepted",
+}
+
+
 def _answer_marks(explanation: Explanation, theme: Theme) -> list[Line2D]:
-    best = explanation.trace.hypotheses[0]
-    verdict = "accepted" if best.accepted else "not accepted"
+    verdict = _VERDICTS[state_of(explanation.trace.hypotheses)]
     marks = [mark("^", theme.reference, f"best answer ({verdict})")]
     if explanation.truth is not None:
         marks.append(mark("o", theme.angle, "pose in the log", hollow=True))

@@ -13,14 +13,7 @@ that fits better than the right place does.  The logistic of the decision theref
 every set brought an accident of its own and the margin told nothing; 0 trusts the margin alone.
 ``anchorscan bench-fleet`` measures which is right; what it gave stands on the page "A fleet".
 
-What neither sees: two buildings that are the same, floors of one hotel for instance.  Whichever is
-right, their scores differ only by how each map's grid happens to lie, by ``TWINS`` in the root
-mean square.  So a margin to the best fit of another *building* of that size says nothing: the
-probability is held to at most
-
-    1 - exp(-(m / TWINS)^2 / 2) / 2
-
-and what is held back goes to that rival.
+Two buildings may be the same, floors of one hotel for instance.  The decision knows twins.
 
 A part of the sets can be searched elsewhere (``spread_fleet.py``): ``search`` gives values, and
 ``decide_over`` joins them, in any order of the parts, to the same answer.
@@ -47,20 +40,18 @@ from .errors import ReferenceSetError, SettingsError
 from .hypothesis import Hypothesis
 from .reference_set import ReferenceSet
 from .scan import LaserScan
-from .verification import FEATURES, Fits
+from .verification import Fits
 
 if TYPE_CHECKING:
     from .settings import Settings
 
 __all__ = [
     "LOOK_ALIKES",
-    "TWINS",
     "BuildingFits",
     "BuildingHypothesis",
     "BuildingPlace",
     "Fleet",
     "decide_over",
-    "no_twin",
     "ranked",
     "search",
     "set_files",
@@ -69,10 +60,6 @@ __all__ = [
 LOOK_ALIKES = 0.2
 """How fast the odds fall with the number of sets, beyond the margin; fitted on simulated scans."""
 
-TWINS = 0.018
-"""Root mean square of the difference of a scan's scores in two equal, simulated buildings."""
-
-_SCORE = FEATURES.index("score")
 _SUFFIX = ".apr"
 
 
@@ -100,12 +87,14 @@ class BuildingPlace:
         fit: Of length one.
         probability: Knows of all sets.
         accepted: Whether it is an answer.
+        ambiguous: Whether it is one of several places that explain the scan alike.
     """
 
     building: str
     fit: Fits
     probability: float
     accepted: bool
+    ambiguous: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,7 +103,8 @@ class BuildingHypothesis:
 
     Args:
         building: Name of the set.
-        hypothesis: The place in that set; ``probability`` and ``accepted`` know of all sets.
+        hypothesis: The place in that set; ``probability``, ``accepted`` and ``ambiguous`` know of
+            all sets.
     """
 
     building: str
@@ -212,7 +202,8 @@ class Fleet:
             description: Of the scan, with the settings of the sets.
         """
         worth = np.array([place.probability])
-        decision = Decision(worth, 1.0 - place.probability, place.accepted)
+        alike = 1 if place.accepted else 2 * place.ambiguous
+        decision = Decision(worth, 1.0 - place.probability, alike)
         for found in self._sets[place.building].hypotheses(description, place.fit, decision):
             yield BuildingHypothesis(place.building, found)
 
@@ -240,7 +231,6 @@ def decide_over(
     sets: int,
     settings: DecisionSettings,
     look_alikes: float = LOOK_ALIKES,
-    twins: float = TWINS,
 ) -> list[BuildingPlace]:
     """Put what many sets found for one scan into one order, and decide once.
 
@@ -249,7 +239,6 @@ def decide_over(
         sets: How many sets were asked, those without a fit as well.
         settings: Of the decision.
         look_alikes: How fast the odds fall with the number of sets.
-        twins: How far the scores of equal buildings lie apart.
 
     Returns:
         Places in all buildings, best first, as many as one set gives at most.
@@ -260,29 +249,16 @@ def decide_over(
     harder = settings.constant - look_alikes * math.log(max(sets, 1))
     anchors = best[0][0].anchors
     decision = decide(fits, anchors, settings.model_copy(update={"constant": harder}))
-    probabilities = decision.probabilities.tolist()
-    rival = next((k for k, (each, _) in enumerate(best) if each is not best[0][0]), None)
-    if rival is not None:
-        margin = float(fits.features[0, _SCORE] - fits.features[rival, _SCORE])
-        first = min(probabilities[0], no_twin(margin, twins))
-        held_back = probabilities[0] - first
-        probabilities = [min(value, first) for value in probabilities]
-        probabilities[rival] = min(probabilities[rival] + held_back, first)
-    is_answer = probabilities[0] >= settings.threshold
     return [
         BuildingPlace(
             each.building,
             fits[rank : rank + 1],
-            probabilities[rank],
-            is_answer and rank == 0,
+            float(decision.probabilities[rank]),
+            decision.accepted and rank == 0,
+            not decision.accepted and rank < decision.alike,
         )
         for rank, (each, _) in enumerate(best)
     ]
-
-
-def no_twin(margin: float, twins: float = TWINS) -> float:
-    """Return the most that an answer can be worth, by its margin to the best other building."""
-    return 1.0 - 0.5 * math.exp(-0.5 * (max(margin, 0.0) / twins) ** 2)
 
 
 def ranked(found: Sequence[BuildingFits]) -> tuple[list[tuple[BuildingFits, int]], Fits]:

@@ -26,10 +26,10 @@ from numpy.typing import NDArray
 
 from .building import random_building
 from .covariance import held
-from .decision import DecisionSettings, covariance, evidence
+from .decision import DecisionSettings, beside, covariance, evidence
 from .description import Description, describe
 from .errors import AnchorscanError
-from .fleet import LOOK_ALIKES, TWINS, BuildingFits, Fleet, decide_over, no_twin, ranked, search
+from .fleet import LOOK_ALIKES, BuildingFits, Fleet, decide_over, ranked, search
 from .pose import Pose2D
 from .progress import ProgressOf
 from .protocol import Case, is_correct, recall_at_precision, reliability, thin
@@ -95,8 +95,7 @@ class Outcome:
         is_known: Whether its building was among them.
         evidence: (6,) of the best fit of all.
         held: How likely a pose of its covariance is to be near enough.
-        margin: Of its score to that of the best fit of another building; infinite where there
-            is none.
+        most: That the decision lets it be worth beside the others.
         is_right_building: Whether that fit is in the right building.
         is_correct: Whether building and pose are right.
         seconds: All searches and the decision; not the description of the scan, which is made once.
@@ -107,7 +106,7 @@ class Outcome:
     is_known: bool
     evidence: NDArray[np.float64]
     held: float
-    margin: float
+    most: float
     is_right_building: bool
     is_correct: bool
     seconds: float
@@ -277,7 +276,8 @@ def twins(buildings: Mapping[str, Iterable[Twins]], settings: Settings) -> Itera
     }
     widths = {kind: _width(pairs) for kind, pairs in found.items() if pairs}
     for kind, width in widths.items():
-        tried = {"shipped": TWINS, **{other: widths[other] for other in widths if other != kind}}
+        others = {other: widths[other] for other in widths if other != kind}
+        tried = {"shipped": settings.decision.twins, **others}
         told = [
             f"{_answered(found[kind], value, settings)} answered with {value:.4f} ({label})"
             for label, value in tried.items()
@@ -317,9 +317,8 @@ def _width(pairs: Sequence[Sequence[BuildingFits]]) -> float:
 
 
 def _answered(pairs: Sequence[Sequence[BuildingFits]], width: float, settings: Settings) -> int:
-    return sum(
-        decide_over(pair, len(pair), settings.decision, twins=width)[0].accepted for pair in pairs
-    )
+    decision = settings.decision.model_copy(update={"twins": width})
+    return sum(decide_over(pair, len(pair), decision)[0].accepted for pair in pairs)
 
 
 def _twins(
@@ -381,11 +380,9 @@ def outcomes(
         speaks = evidence(fits, best[0][0].anchors)
         right = is_known and best[0][0].building == asked.building
         near = is_correct(Pose2D.from_array(fits.poses[0]), asked.truth)
-        rival = next((k for k, (each, _) in enumerate(best) if each is not best[0][0]), None)
-        scores = fits.features[:, _SCORE]
-        margin = math.inf if rival is None else float(scores[0] - scores[rival])
+        most = beside(fits, settings)
         seconds += time.perf_counter() - start
-        yield Outcome(asked, size, is_known, speaks, within, margin, right, right and near, seconds)
+        yield Outcome(asked, size, is_known, speaks, within, most, right, right and near, seconds)
 
 
 def probabilities(
@@ -396,7 +393,7 @@ def probabilities(
     speaks -= look_alikes * np.log([each.sets for each in results])
     likely: NDArray[np.float64] = np.array([each.held for each in results])
     likely /= 1.0 + np.exp(-speaks)
-    return np.minimum(likely, [no_twin(each.margin) for each in results])
+    return np.minimum(likely, [each.most for each in results])
 
 
 def log_loss(results: Sequence[Outcome], look_alikes: float, settings: DecisionSettings) -> float:

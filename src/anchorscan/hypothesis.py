@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .pose import Pose2D
 
-__all__ = ["Hypothesis"]
+__all__ = ["Hypothesis", "state_of"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,6 +29,9 @@ class Hypothesis:
         score: What the hypotheses of one query are ordered by; comparable within one preset.
         probability: That the pose is right, in [0, 1].
         accepted: Whether the probability reaches the shipped threshold.
+        ambiguous: Whether this is one of two or more places that explain the scan alike: none is
+            accepted, and the first would be without the others.  Of single scans that are
+            searched as one map; a belief over time has its ``state``.
     """
 
     reference: int
@@ -38,3 +43,15 @@ class Hypothesis:
     score: float
     probability: float
     accepted: bool
+    ambiguous: bool = False
+
+
+def state_of(hypotheses: Sequence[Hypothesis]) -> Literal["located", "ambiguous", "unknown"]:
+    """Say in a word what the hypotheses of one scan amount to.
+
+    Args:
+        hypotheses: Best first.
+    """
+    if hypotheses and hypotheses[0].accepted:
+        return "located"
+    return "ambiguous" if hypotheses and hypotheses[0].ambiguous else "unknown"

@@ -126,6 +126,8 @@ class Answer:
         accepted: Whether the method itself stands by the answer.
         seconds: Time for the query with all preprocessing.
         covariance: (3, 3) of the pose and, where it is known, of the truth; or None.
+        others: ``T_set_laser`` of the other places that explain the scan alike, if it is
+            ambiguous.
     """
 
     query: int
@@ -135,6 +137,7 @@ class Answer:
     accepted: bool
     seconds: float
     covariance: NDArray[np.float64] | None = None
+    others: tuple[Pose2D, ...] = ()
 
     @property
     def position_error(self) -> float:
@@ -154,6 +157,11 @@ class Answer:
     def is_correct(self) -> bool:
         """Whether the pose is within 0.5 m and 10 degrees of the truth."""
         return self.position_error <= CORRECT_POSITION and self.heading_error <= CORRECT_HEADING
+
+    @property
+    def is_named(self) -> bool:
+        """Whether the answer or one of the other places alike is correct."""
+        return self.is_correct or any(is_correct(other, self.truth) for other in self.others)
 
     @property
     def squared_error(self) -> float:
@@ -197,6 +205,8 @@ class Figures:
         correct: Accepted and correct.
         wrong: Accepted and wrong.
         silent: Not accepted.
+        ambiguous: Those of them that are said to have been taken at one of several places.
+        named: Ambiguous, and one of these places is correct.
         calibration_error: Expected calibration error over ten bins; NaN without an answer.
         time_median: Seconds a query; ``time_mean``, ``time_99``, ``time_maximum`` alike.
         time_mean: Mean seconds.
@@ -217,6 +227,8 @@ class Figures:
     correct: int
     wrong: int
     silent: int
+    ambiguous: int
+    named: int
     calibration_error: float
     time_median: float
     time_mean: float
@@ -457,6 +469,7 @@ def figures(answers: Iterable[Answer]) -> Figures:
     accepted = np.array([answer.accepted for answer in given])
     seconds = np.array([answer.seconds for answer in given])
     hits = [answer for answer in given if answer.is_correct]
+    ambiguous = [answer for answer in given if answer.others]
     squared = np.array([answer.squared_error for answer in hits])
     position = [answer.position_error for answer in hits]
     heading = [answer.heading_error for answer in hits]
@@ -468,6 +481,8 @@ def figures(answers: Iterable[Answer]) -> Figures:
         correct=int(np.sum(accepted & correct)),
         wrong=int(np.sum(accepted & ~correct)),
         silent=int(np.sum(~accepted)),
+        ambiguous=len(ambiguous),
+        named=sum(answer.is_named for answer in ambiguous),
         calibration_error=reliability(probability, correct).error,
         time_median=float(np.median(seconds)),
         time_mean=float(seconds.mean()),

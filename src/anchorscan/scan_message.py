@@ -133,6 +133,7 @@ def hypothesis_values(hypothesis: Hypothesis) -> dict[str, Any]:
         "score": _finite(hypothesis.score),
         "probability": hypothesis.probability,
         "accepted": hypothesis.accepted,
+        "ambiguous": hypothesis.ambiguous,
     }
 
 
@@ -156,6 +157,7 @@ def hypothesis_of(values: Mapping[str, Any]) -> Hypothesis:
             score=_number(values["score"]),
             probability=float(values["probability"]),
             accepted=bool(values["accepted"]),
+            ambiguous=bool(values.get("ambiguous", False)),
         )
     except (KeyError, TypeError) as error:
         raise ValueError(f"no hypothesis: {error}") from None

@@ -236,6 +236,11 @@ class Scoreboard:
             _unknown_rows(by_protocol["P4"]),
         )
         yield (
+            "Ambiguous: silent, but told to be at one of two or three places",
+            _AMBIGUOUS_COLUMNS,
+            [_ambiguous_cells(s) for s in self.scores if s.figures.ambiguous],
+        )
+        yield (
             "Against exhaustive search, same scans",
             _COMPARISON_COLUMNS,
             [_comparison_cells(one) for one in self.comparisons],
@@ -307,6 +312,7 @@ _PAPER_COLUMNS = (
     *("recall\n100 %", "recall\n99 %", "mean\nms", "longest\nms"),
 )
 _UNKNOWN_COLUMNS = ("references of", "method", "buildings asked", "queries", "answers", "share")
+_AMBIGUOUS_COLUMNS = ("", "log", "method", "queries", "ambiguous", "right one\namong these")
 _COMPARISON_COLUMNS = (
     *("", "log", "method", "queries", "correct of\nexhaustive", "of these\nalso found"),
     "times\nfaster",
@@ -360,6 +366,12 @@ def _unknown_rows(scores: Sequence[Score]) -> list[Sequence[str]]:
         share = _number(answers / queries, 5)
         rows.append((building, method, str(len(same)), str(queries), str(answers), share))
     return rows
+
+
+def _ambiguous_cells(score: Score) -> Sequence[str]:
+    f = score.figures
+    counts = (str(f.queries), str(f.ambiguous), str(f.named))
+    return (score.protocol, score.place, score.method, *counts)
 
 
 def _comparison_cells(one: Comparison) -> Sequence[str]:

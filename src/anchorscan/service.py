@@ -38,6 +38,7 @@ from pydantic_core import to_json
 
 from .errors import AnchorscanError, MissingExtraError, ScanError, SettingsError
 from .fleet import BuildingHypothesis
+from .hypothesis import state_of
 from .reference_set import ReferenceSet
 from .scan import LaserScan
 from .scan_message import BINARY, hypothesis_values, unpacked
@@ -99,6 +100,7 @@ _METRICS_FOLDER = "PROMETHEUS_MULTIPROC_DIR"
 _SQLITE = "application/vnd.sqlite3"
 _OCTETS = "application/octet-stream"
 _JSON = "application/json"
+_OUTCOMES = {"unknown": "not known"}
 _LOG = logging.getLogger("anchorscan.service")
 
 Result = TypeVar("Result")
@@ -549,6 +551,7 @@ def _locate(
         answers.append(
             {
                 "accepted": bool(found) and found[0].accepted,
+                "state": state_of(found),
                 "seconds": time.perf_counter() - start,
                 "hypotheses": [hypothesis_values(each) for each in found],
             }
@@ -562,6 +565,7 @@ def _which(scan: LaserScan, shelf: Shelf, _: float) -> dict[str, Any]:
     found = fleet.locate(scan)
     return {
         "accepted": bool(found) and found[0].hypothesis.accepted,
+        "state": state_of([each.hypothesis for each in found]),
         "seconds": time.perf_counter() - start,
         "sets": len(fleet),
         "hypotheses": [_named(each, versions) for each in found],
@@ -789,7 +793,7 @@ class _Metrics:
 
     def count(self, answers: Sequence[dict[str, Any]]) -> None:
         for answer in answers:
-            outcome = "located" if answer["accepted"] else "not known"
+            outcome = _OUTCOMES.get(answer["state"], answer["state"])
             self._scans.labels(outcome if answer["hypotheses"] else "unusable").inc()
 
     def text(self) -> bytes:

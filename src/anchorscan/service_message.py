@@ -155,12 +155,14 @@ class HypothesisOut(PoseOut):
     score: float | None
     probability: float
     accepted: bool
+    ambiguous: bool
 
 
 class AnswerOut(BaseModel):
     """What is said to one scan; hypotheses best first."""
 
     accepted: bool
+    state: str
     seconds: float
     hypotheses: list[HypothesisOut]
 
@@ -189,6 +191,7 @@ class WhichOut(BaseModel):
     """What is said to one scan; probabilities know of all sets."""
 
     accepted: bool
+    state: str
     seconds: float
     sets: int
     hypotheses: list[BuildingHypothesisOut]

@@ -369,6 +369,7 @@ class StitchedMap:
                 score=scores[n],
                 probability=probabilities[n],
                 accepted=decision.accepted and n == 0,
+                ambiguous=n < decision.alike and not decision.accepted,
             )
             for n, each in enumerate(known)
         )

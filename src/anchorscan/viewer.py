@@ -289,6 +289,8 @@ def _words(answer: ScanAnswer) -> str:
     best = answer.guesses[0]
     where = f"near reference {best.reference}" if best.pose is None else _where(best.pose)
     verdict = "located" if answer.accepted else "not known; best guess"
+    if best.ambiguous:
+        verdict = "at one of several places alike; best guess"
     return f"scan {answer.scan}: {verdict} {where}, probability {best.probability:.3f}"
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import signal
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Iterable, Iterator
 from itertools import islice, tee
 from pathlib import Path
@@ -62,15 +62,13 @@ def locate(
     opened = reading.open(log)
     chosen = settings.read()
     records = records_shown(opened, "locating", output)
-    accepted = unusable = count = 0
+    told: Counter[str] = Counter()
     lines = _located(records, set_file, chosen, candidates, processes, opened)
     for line in write_lines(lines, output):
-        count += 1
-        accepted += line["accepted"]
-        unusable += "reason" in line
+        told["unusable" if "reason" in line else line["state"]] += 1
     say(
-        f"{log}: {count} scans: {accepted} located, {count - accepted - unusable} not known, "
-        f"{unusable} unusable"
+        f"{log}: {told.total()} scans: {told['located']} located, {told['ambiguous']} ambiguous, "
+        f"{told['unknown']} not known, {told['unusable']} unusable"
     )
 
 
@@ -174,6 +172,8 @@ class _Locator:
 
     def line(self, record: Record) -> dict[str, Any]:
         """Return the line of ``locate`` for a record."""
+        from ..hypothesis import state_of
+
         hypotheses: list[Hypothesis] = []
         start = time.perf_counter()
         if record.scan is not None:
@@ -184,6 +184,7 @@ class _Locator:
             "stamp": record.stamp,
             "seconds": round(seconds, _DECIMALS + 1),
             "accepted": bool(hypotheses) and hypotheses[0].accepted,
+            "state": state_of(hypotheses),
             "hypotheses": [_hypothesis_line(hypothesis) for hypothesis in hypotheses],
         }
         if not hypotheses:
@@ -250,6 +251,7 @@ def _which_lines(fleet: SpreadFleet, records: Iterable[Record]) -> Iterator[dict
     """Yield the line of ``which`` for every record; its time is that since the one before."""
     import numpy as np
 
+    from ..hypothesis import state_of
     from ..scan import LaserScan
 
     nothing = LaserScan(np.empty(0, np.float32), 0.0, 1.0)
@@ -262,6 +264,7 @@ def _which_lines(fleet: SpreadFleet, records: Iterable[Record]) -> Iterator[dict
             "stamp": record.stamp,
             "seconds": round(time.perf_counter() - start, _DECIMALS + 1),
             "accepted": bool(found) and found[0].hypothesis.accepted,
+            "state": state_of([each.hypothesis for each in found]),
             "hypotheses": [
                 {"building": each.building, **_hypothesis_line(each.hypothesis)} for each in found
             ],
@@ -315,6 +318,7 @@ def _hypothesis_line(hypothesis: Hypothesis) -> dict[str, Any]:
         "evaluation": round(hypothesis.evaluation, _DECIMALS),
         "quality": round(hypothesis.quality, _DECIMALS),
         "probability": round(hypothesis.probability, _DECIMALS),
+        "ambiguous": hypothesis.ambiguous,
         "score": _significant(hypothesis.score),
         "pose_in_reference": _pose_line(hypothesis.pose_in_reference),
     }

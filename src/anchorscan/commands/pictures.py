@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from enum import Enum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -89,12 +89,21 @@ def explain(
     themes = [each for name, each in THEMES.items() if theme.value in (name, "both")]
     for path in save_all(explanation, output, themes, file_format.value):
         typer.echo(str(path))
-    say(f"{log}: scan {scan}: {_verdict(trace.hypotheses[0])}")
+    say(f"{log}: scan {scan}: {_verdict(trace.hypotheses)}")
 
 
-def _verdict(best: Hypothesis) -> str:
-    """Say in words what a best hypothesis amounts to."""
-    verdict = "located" if best.accepted else "not known; the best guess is"
+_VERDICTS = {
+    "located": "located",
+    "ambiguous": "at one of several places alike; the best guess is",
+    "unknown": "not known; the best guess is",
+}
+
+
+def _verdict(hypotheses: Sequence[Hypothesis]) -> str:
+    """Say in words what hypotheses amount to."""
+    from ..hypothesis import state_of
+
+    best, verdict = hypotheses[0], _VERDICTS[state_of(hypotheses)]
     pose, frame = best.pose, "x {0.x:.2f} m, y {0.y:.2f} m, {1:.0f} degrees"
     if pose is None:
         pose, frame = best.pose_in_reference, f"reference {best.reference}, {frame}"
