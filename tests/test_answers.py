@@ -33,6 +33,7 @@ LOCATED = {
             "evaluation": 0.87,
             "quality": 0.41,
             "probability": 0.997,
+            "ambiguous": True,
         },
         {"reference": 5, "x": None, "y": None, "theta": None, "probability": 0.003},
     ],
@@ -62,6 +63,7 @@ def test_a_line_of_locate_is_read_as_it_was_written(tmp_path: Path) -> None:
     assert (first.evaluation, first.quality, first.probability) == (0.87, 0.41, 0.997)
     assert first.covariance is not None
     assert first.covariance[1, 1] == 2.0
+    assert (first.ambiguous, second.ambiguous) == (True, False)  # older lines do not say
     assert second.pose is None
     assert math.isnan(second.evaluation)
     assert (other.guesses, other.reason, other.stamp) == ((), "no reading is a return", None)

@@ -6,6 +6,7 @@ import math
 import os
 import shutil
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -156,6 +157,18 @@ def test_keys_and_buttons_step_through_queries(show: Callable[..., Shown], offic
     assert page.scan() == seen[0]
     page.press(Keys.END)
     assert page.scan() == seen[-1]
+
+
+def test_an_ambiguous_scan_says_how_many_places_are_alike(
+    show: Callable[..., Shown], office: Any
+) -> None:
+    runs, references, logs = office
+    twin = Guess(Pose2D(9.0, 0.0, 0.0), 0.45, reference=2, ambiguous=True)
+    unsure = answer(2, 2.1, 0.5, accepted=False, more=(twin, Guess(Pose2D(), 0.01, 1)))
+    first = replace(unsure.guesses[0], ambiguous=True)
+    unsure = replace(unsure, guesses=(first, *unsure.guesses[1:]))
+    page = show([located(unsure)], references, logs, address="#run=0&scan=2")
+    assert page.text("verdict").endswith("; ambiguous: 2 places explain it alike")
 
 
 def test_an_unusable_scan_says_why(show: Callable[..., Shown], office: Any) -> None:

@@ -368,6 +368,7 @@ def _guess_data(guess: Guess, truth: Pose2D | None) -> dict[str, Any]:
         "e": _number(guess.evaluation, 3),
         "q": _number(guess.quality, 4),
         "score": _number(guess.score, 4),
+        "alike": guess.ambiguous,
         "spread": None
         if spread is None
         else [_number(spread[row, column], 6) or 0.0 for row, column in ((0, 0), (0, 1), (1, 1))],

@@ -482,7 +482,9 @@ function showQuery() {
     return;
   }
   element("position").textContent = `${state.at + 1} of ${state.list.length}`;
-  element("verdict").textContent = `Scan ${each.scan}: ${STATES[stateOf(each)]}`;
+  const alike = each.hypotheses.filter((one) => one.alike).length;
+  element("verdict").textContent = `Scan ${each.scan}: ${STATES[stateOf(each)]}`
+    + (alike ? `; ambiguous: ${alike} places explain it alike` : "");
   const facts = [];
   if (each.stamp !== null) facts.push(`at ${each.stamp.toFixed(2)} s`);
   if (each.seconds !== null) facts.push(`${(1000 * each.seconds).toFixed(2)} ms`);
