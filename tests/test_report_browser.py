@@ -162,7 +162,7 @@ def test_keys_and_buttons_step_through_queries(show: Callable[..., Shown], offic
 def test_an_ambiguous_scan_says_how_many_places_are_alike(
     show: Callable[..., Shown], office: Any
 ) -> None:
-    runs, references, logs = office
+    _, references, logs = office
     twin = Guess(Pose2D(9.0, 0.0, 0.0), 0.45, reference=2, ambiguous=True)
     unsure = answer(2, 2.1, 0.5, accepted=False, more=(twin, Guess(Pose2D(), 0.01, 1)))
     first = replace(unsure.guesses[0], ambiguous=True)
