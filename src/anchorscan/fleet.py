@@ -13,7 +13,8 @@ that fits better than the right place does.  The logistic of the decision theref
 every set brought an accident of its own and the margin told nothing; 0 trusts the margin alone.
 ``anchorscan bench-fleet`` measures which is right; what it gave stands on the page "A fleet".
 
-Two buildings may be the same, floors of one hotel for instance.  The decision knows twins.
+Two buildings may be the same, floors of one hotel for instance.  The decision knows twins; here,
+where they are likelier than within one building, it takes them to differ by ``TWINS``.
 
 A part of the sets can be searched elsewhere (``spread_fleet.py``): ``search`` gives values, and
 ``decide_over`` joins them, in any order of the parts, to the same answer.
@@ -47,6 +48,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "LOOK_ALIKES",
+    "TWINS",
     "BuildingFits",
     "BuildingHypothesis",
     "BuildingPlace",
@@ -59,6 +61,9 @@ __all__ = [
 
 LOOK_ALIKES = 0.2
 """How fast the odds fall with the number of sets, beyond the margin; fitted on simulated scans."""
+
+TWINS = 0.018
+"""Root mean square of the difference of a scan's scores in two equal, simulated buildings."""
 
 _SUFFIX = ".apr"
 
@@ -231,6 +236,7 @@ def decide_over(
     sets: int,
     settings: DecisionSettings,
     look_alikes: float = LOOK_ALIKES,
+    twins: float = TWINS,
 ) -> list[BuildingPlace]:
     """Put what many sets found for one scan into one order, and decide once.
 
@@ -239,6 +245,7 @@ def decide_over(
         sets: How many sets were asked, those without a fit as well.
         settings: Of the decision.
         look_alikes: How fast the odds fall with the number of sets.
+        twins: How far the scores of equal buildings lie apart.
 
     Returns:
         Places in all buildings, best first, as many as one set gives at most.
@@ -248,7 +255,8 @@ def decide_over(
     best, fits = ranked(found)
     harder = settings.constant - look_alikes * math.log(max(sets, 1))
     anchors = best[0][0].anchors
-    decision = decide(fits, anchors, settings.model_copy(update={"constant": harder}))
+    stricter = settings.model_copy(update={"constant": harder, "twins": twins})
+    decision = decide(fits, anchors, stricter)
     return [
         BuildingPlace(
             each.building,

@@ -29,7 +29,7 @@ from .covariance import held
 from .decision import DecisionSettings, beside, covariance, evidence
 from .description import Description, describe
 from .errors import AnchorscanError
-from .fleet import LOOK_ALIKES, BuildingFits, Fleet, decide_over, ranked, search
+from .fleet import LOOK_ALIKES, TWINS, BuildingFits, Fleet, decide_over, ranked, search
 from .pose import Pose2D
 from .progress import ProgressOf
 from .protocol import Case, is_correct, recall_at_precision, reliability, thin
@@ -277,7 +277,7 @@ def twins(buildings: Mapping[str, Iterable[Twins]], settings: Settings) -> Itera
     widths = {kind: _width(pairs) for kind, pairs in found.items() if pairs}
     for kind, width in widths.items():
         others = {other: widths[other] for other in widths if other != kind}
-        tried = {"shipped": settings.decision.twins, **others}
+        tried = {"shipped": TWINS, **others}
         told = [
             f"{_answered(found[kind], value, settings)} answered with {value:.4f} ({label})"
             for label, value in tried.items()
@@ -317,8 +317,9 @@ def _width(pairs: Sequence[Sequence[BuildingFits]]) -> float:
 
 
 def _answered(pairs: Sequence[Sequence[BuildingFits]], width: float, settings: Settings) -> int:
-    decision = settings.decision.model_copy(update={"twins": width})
-    return sum(decide_over(pair, len(pair), decision)[0].accepted for pair in pairs)
+    return sum(
+        decide_over(pair, len(pair), settings.decision, twins=width)[0].accepted for pair in pairs
+    )
 
 
 def _twins(
@@ -380,7 +381,7 @@ def outcomes(
         speaks = evidence(fits, best[0][0].anchors)
         right = is_known and best[0][0].building == asked.building
         near = is_correct(Pose2D.from_array(fits.poses[0]), asked.truth)
-        most = beside(fits, settings)
+        most = beside(fits, settings.model_copy(update={"twins": TWINS}))
         seconds += time.perf_counter() - start
         yield Outcome(asked, size, is_known, speaks, within, most, right, right and near, seconds)
 
