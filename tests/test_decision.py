@@ -22,6 +22,7 @@ from anchorscan import (
     simulate,
 )
 from anchorscan.decision import (
+    Decision,
     DecisionSettings,
     _shared,
     _worths,
@@ -172,7 +173,7 @@ def test_a_scan_that_one_place_explains_is_an_answer_and_one_that_two_do_is_none
     assert decide(fits_of([0.95, 0.45]), MANY, preset).accepted
     twins = decide(fits_of([0.95, 0.95]), MANY, preset)
     assert not twins.accepted
-    assert twins.probabilities[1] > 0.5 * twins.probabilities[0]
+    assert twins.probabilities[0] == twins.probabilities[1] > 0.45
     assert not decide(fits_of([0.3, 0.1]), MANY, preset).accepted
 
 
@@ -190,19 +191,42 @@ def test_places_that_explain_a_scan_alike_are_counted(preset: DecisionSettings) 
 
 
 @PRESETS
-@given(scores=scores_of_fits, through=shares, anchors=st.integers(0, 60))
-def test_without_the_others_the_best_of_places_alike_is_an_answer(
-    preset: DecisionSettings, scores: list[float], through: float, anchors: int
+@given(
+    scores=scores_of_fits,
+    apart=st.lists(st.floats(0.0, 0.05), max_size=4),
+    through=shares,
+    anchors=st.integers(0, 60),
+)
+def test_places_alike_are_those_without_which_the_best_is_an_answer(
+    preset: DecisionSettings,
+    scores: list[float],
+    apart: list[float],
+    through: float,
+    anchors: int,
 ) -> None:
-    def without(others: int) -> bool:
-        return decide(
-            fits_of([scores[0], *scores[1 + others :]], through), anchors, preset
-        ).accepted
+    scores = sorted([*scores, *(scores[0] - each for each in apart)], reverse=True)
 
+    def without(others: int) -> Decision:
+        left = [scores[0], *scores[1 + others :]]
+        return decide(fits_of(left, through), anchors, preset)
+
+    def is_near(rank: int) -> bool:
+        apart = (scores[0] - scores[rank]) / preset.twins
+        return 1.0 - 0.5 * math.exp(-0.5 * apart**2) < preset.threshold
+
+    expected, alone = 0, without(0)
+    for others in range(min(len(scores), preset.most_alike)):
+        if others and not is_near(others):
+            break
+        alone = without(others)
+        if alone.accepted:
+            expected = others + 1
+            break
     decision = decide(fits_of(scores, through), anchors, preset)
-    most = min(len(scores), preset.most_alike)
-    answers = [others + 1 for others in range(most) if without(others)]
-    assert decision.alike == (answers[0] if answers else 0)
+    assert decision.alike == expected
+    if expected:  # it is at one of them, as surely as it would be at the only one
+        together = decision.probabilities[:expected].sum()
+        assert together == pytest.approx(alone.probabilities[0])
 
 
 @PRESETS
@@ -298,9 +322,16 @@ def test_evidence_is_what_the_text_says() -> None:
     assert np.all(np.isfinite(evidence(fits_of([1.0, 1.0], readings=0), 0)))
 
 
-@given(best=shares, scores=scores_of_fits, through=shares, rivalry=st.floats(0.1, 100.0))
+@given(
+    best=shares,
+    scores=scores_of_fits,
+    through=shares,
+    rivalry=st.floats(0.1, 100.0),
+    alike=st.integers(1, 3),
+    more=shares,
+)
 def test_what_the_best_leaves_is_shared_as_the_text_says(
-    best: float, scores: list[float], through: float, rivalry: float
+    best: float, scores: list[float], through: float, rivalry: float, alike: int, more: float
 ) -> None:
     fits = fits_of(scores, through)
     features = np.nan_to_num(fits.features)
@@ -310,8 +341,13 @@ def test_what_the_best_leaves_is_shared_as_the_text_says(
         for score, ray in features[:, [SCORE, THROUGH]].tolist()
     ]
     np.testing.assert_allclose(worths, expected)
-    given_to, elsewhere = _shared(best, worths, 1.5, rivalry)
-    rivals = np.exp(rivalry * (np.array([*expected[1:], 1.5]) - max([*expected[1:], 1.5])))
-    plain = np.minimum((1.0 - best) * rivals[:-1] / rivals.sum(), best)
-    np.testing.assert_allclose(given_to, [best, *plain], atol=1e-12)
-    np.testing.assert_allclose(elsewhere, max(1.0 - best - plain.sum(), 0.0), atol=1e-12)
+    alike = min(alike, len(scores))
+    together = best if alike == 1 else best + more * (1.0 - best)
+    given_to, elsewhere = _shared((best, together, alike), worths, 1.5, rivalry)
+    first = max(best, together / alike)
+    same = [(together - first) / (alike - 1)] * (alike - 1) if alike > 1 else []
+    others = [*expected[alike:], 1.5]
+    rivals = np.exp(rivalry * (np.array(others) - max(others)))
+    plain = np.minimum((1.0 - together) * rivals[:-1] / rivals.sum(), [first, *same][-1])
+    np.testing.assert_allclose(given_to, [first, *same, *plain], atol=1e-12)
+    np.testing.assert_allclose(elsewhere, max(1.0 - together - plain.sum(), 0.0), atol=1e-12)

@@ -38,11 +38,12 @@ held to at most
 with the score's margin ``m`` to the highest of any other place, whatever rays see through there:
 doors are opened and walls taken away.
 
-Where two or three places explain a scan alike, none is an answer, and to say "not known" would
-keep something back: it is at one of them.  Such a scan is *ambiguous*: without the other places
-the best would be an answer.  They are left out one by one, best first, until it is.
+Where two or three places explain a scan alike, their scores no farther apart than those of equal
+places, none is an answer, and to say "not known" would keep something back: it is at one of them.
+Such a scan is *ambiguous*: without the other places the best would be an answer.  They are left
+out one by one, best first, until it is, and share what it is worth then.
 
-What is left goes to the other fits and to "somewhere else", in proportion to
+What is left goes to the other fits, and to "somewhere else", in proportion to
 ``exp(rivalry * worth)``; "somewhere else" competes with a fixed score.  No fit gets more than
 the best: what that would be is "somewhere else", too.
 
@@ -244,13 +245,21 @@ def _decided(features, hessians, residuals, counts, weights, deviations, others,
     threshold, most, twins = answer
     best = known * _place(_evidence(features, 1, heading, counts), weights)
     best = min(best, _beside(features, 1, twins))
-    shared, elsewhere = _shared(best, _worths(features), worth(others[0], 0.0), others[1])
     alone, alike = best, 1
-    while alone < threshold and alike < min(most, len(features)):
+    while (
+        alone < threshold
+        and alike < min(most, len(features))
+        and _beside(features[: alike + 1], alike, twins) < threshold
+    ):
         alike += 1
         alone = known * _place(_evidence(features, alike, heading, counts), weights)
         alone = min(alone, _beside(features, alike, twins))
-    return shared, elsewhere, alike if alone >= threshold else 0
+    if alone < threshold:
+        alone, alike = best, 0
+    shared, elsewhere = _shared(
+        (best, alone, max(alike, 1)), _worths(features), worth(others[0], 0.0), others[1]
+    )
+    return shared, elsewhere, alike
 
 
 @kernel
@@ -296,19 +305,22 @@ def _worths(features):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _shared(best, worths, elsewhere, rivalry):  # type: ignore[no-untyped-def]
-    """What the best leaves, shared among the other fits and "somewhere else"."""
+def _shared(found, worths, elsewhere, rivalry):  # type: ignore[no-untyped-def]
+    """What the best leaves, shared among those alike, and then the others and "somewhere else"."""
+    best, together, alike = found
+    probabilities = np.empty(len(worths))
+    probabilities[0] = max(best, together / alike)
+    for k in range(1, alike):
+        probabilities[k] = (together - probabilities[0]) / (alike - 1)
     highest = elsewhere
-    for value in worths[1:]:
+    for value in worths[alike:]:
         highest = max(highest, value)
     total = math.exp(rivalry * (elsewhere - highest))
-    for value in worths[1:]:
+    for value in worths[alike:]:
         total += math.exp(rivalry * (value - highest))
-    probabilities = np.empty(len(worths))
-    probabilities[0] = best
-    left = 1.0 - best
-    for k in range(1, len(worths)):
-        share = (1.0 - best) * math.exp(rivalry * (worths[k] - highest)) / total
-        probabilities[k] = min(share, best)
+    left = 1.0 - together
+    for k in range(alike, len(worths)):
+        share = (1.0 - together) * math.exp(rivalry * (worths[k] - highest)) / total
+        probabilities[k] = min(share, probabilities[alike - 1])
         left -= probabilities[k]
     return probabilities, max(left, 0.0)
