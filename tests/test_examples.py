@@ -88,3 +88,18 @@ def test_a_wider_view_is_asked_in_all_four_ways(log: Path) -> None:
         assert number > 10
         assert top >= 0.8 * number
         assert wrong <= 0.05 * accepted
+
+
+def test_where_a_building_stands_twice_hardly_anything_is_answered(log: Path) -> None:
+    told = [line.split() for line in lines("equal_places.py", log, "--queries", 20)[1:]]
+    rows = {float(width): list(map(int, counts)) for width, *counts, _ in told}
+    assert list(rows) == [0.0, 0.005, 0.012, 0.018]
+    loosest, shipped = rows[0.0], rows[0.012]
+    asked, alone, doubled, ambiguous, both = shipped
+    assert asked >= 15
+    assert alone >= 10
+    assert doubled <= 0.2 * loosest[1]
+    assert doubled < loosest[2]
+    assert ambiguous >= 0.8 * loosest[1]
+    assert both >= 0.9 * ambiguous
+    assert 0.0 < float(told[2][-1]) < 0.05
