@@ -237,6 +237,16 @@ def decide(fits: Fits, anchors: int, settings: DecisionSettings) -> Decision:
     return Decision(probabilities, elsewhere, alike)
 
 
+def beside(fits: Fits, settings: DecisionSettings) -> float:
+    """Return the most that the best fit can be worth beside the others, one of which may be a twin.
+
+    Args:
+        fits: At least one.
+        settings: Of the decision.
+    """
+    return float(_beside(fits.features, 1, settings.twins))
+
+
 @kernel
 def _decided(features, hessians, residuals, counts, weights, deviations, others, answer):  # type: ignore[no-untyped-def]
     """Probability of each fit, of none of them, and how many of the first are alike."""
@@ -269,16 +279,6 @@ def _beside(features, second, twins):  # type: ignore[no-untyped-def]
     for k in range(second, len(features)):
         margin = min(margin, max(features[0, _SCORE] - features[k, _SCORE], 0.0))
     return 1.0 - 0.5 * math.exp(-0.5 * (margin / twins) ** 2)
-
-
-def beside(fits: Fits, settings: DecisionSettings) -> float:
-    """Return the most that the best fit can be worth beside the others, one of which may be a twin.
-
-    Args:
-        fits: At least one.
-        settings: Of the decision.
-    """
-    return float(_beside(fits.features, 1, settings.twins))
 
 
 @kernel

@@ -65,6 +65,7 @@ __all__ = ["FORMATS", "PICTURES", "THEMES", "draw", "save_all"]
 FORMATS = ("png", "svg", "pdf")
 THEMES = {theme.name: theme for theme in (LIGHT, DARK)}
 
+_VERDICTS = {"located": "accepted", "ambiguous": "one of several alike", "unknown": "“not known”"}
 _DASHED = (0, (4, 3))
 _MOST_VOTES = 12
 _MOST_FITS = 9
@@ -689,7 +690,7 @@ def _plot_worth(axes: Axes, search: MapSearch, theme: Theme) -> None:
     axes.set_xlim(0.0, 1.45)
     axes.set_xticks([0.0, 0.5, 1.0])
     axes.set_xlabel("score of the fit")
-    verdict = {0: "“not known”", 1: "accepted"}.get(search.decision.alike, "ambiguous")
+    verdict = _VERDICTS[state_of(search.hypotheses)]
     axes.set_title(f"{verdict}\np elsewhere = {search.decision.elsewhere:.3f}")
 
 
@@ -757,13 +758,6 @@ def _plot_truth(axes: Axes, explanation: Explanation, theme: Theme) -> None:
     if explanation.truth is not None:
         x, y = explanation.truth.x, explanation.truth.y
         axes.plot(x, y, "o", ms=17, mfc="none", mec=theme.angle, mew=2.0, zorder=7)
-
-
-_VERDICTS = {
-    "located": "accepted",
-    "ambiguous": "one of several alike",
-    "unknown": "not accepted",
-}
 
 
 def _answer_marks(explanation: Explanation, theme: Theme) -> list[Line2D]:
