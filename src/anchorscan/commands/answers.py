@@ -101,16 +101,17 @@ def which(
     chosen = settings.read()
     records = records_shown(opened, "asking", output)
     accepted: dict[str, int] = {}
-    count = 0
+    count = ambiguous = 0
     with sharing.cluster() as spread:
         fleet = SpreadFleet(places, spread, chosen)
         for line in write_lines(_which_lines(fleet, records), output):
             count += 1
+            ambiguous += line["state"] == "ambiguous"
             if line["accepted"]:
                 building = line["hypotheses"][0]["building"]
                 accepted[building] = accepted.get(building, 0) + 1
     told = ", ".join(f"{number} in {name}" for name, number in sorted(accepted.items()))
-    say(f"{log}: {count} scans, {len(fleet)} sets: {told or 'none located'}")
+    say(f"{log}: {count} scans, {len(fleet)} sets: {told or 'none located'}, {ambiguous} ambiguous")
 
 
 def track(
