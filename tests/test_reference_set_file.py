@@ -17,6 +17,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
+from dataclasses import replace
 from pathlib import Path
 from urllib.parse import quote
 
@@ -28,7 +29,17 @@ from reference_set_kills import BATCH, WAYS, check_bits, kill_many, pose_of, sca
 
 from anchorscan import LaserScan, Pose2D, Record, ReferenceSet, ReferenceSetError
 from anchorscan import set_file as set_file_module
-from anchorscan.set_file import FORMAT, Place, SetContent, SetFile, create_set, read_set
+from anchorscan.set_file import (
+    _LAST_IDENTIFIER,
+    FORMAT,
+    Place,
+    SetContent,
+    SetFile,
+    _load_header,
+    _store_header,
+    create_set,
+    read_set,
+)
 
 NOBODY = 65534
 
@@ -683,6 +694,23 @@ class TestFullDisk:
             told(path, "all is stored, but part of it in a.apr-wal", places.close)
         assert len(content_of(path)) == 29 + 40
         assert [file.name for file in tmp_path.iterdir()] == ["a.apr"]
+
+
+def test_a_set_whose_numbers_are_used_up_takes_no_more_and_stays_sound(tmp_path: Path) -> None:
+    path = tmp_path / "a.apr"
+    with ReferenceSet(path=path) as places:
+        places.add(scan_of(0), pose_of(0))
+    with closing(sqlite3.connect(path, isolation_level=None)) as connection:
+        connection.execute("BEGIN")
+        header = replace(_load_header(connection), next_identifier=_LAST_IDENTIFIER - 1)
+        _store_header(connection, header)
+        connection.execute("COMMIT")
+    with ReferenceSet.open(path) as places:
+        told(path, "no number is left", lambda: places.add_batch([scan_of(1), scan_of(2)]))
+        assert places.add(scan_of(1), pose_of(1)) == _LAST_IDENTIFIER - 1
+        told(path, "no number is left", lambda: places.add(scan_of(2), pose_of(2)))
+    with ReferenceSet.open(path) as places:
+        assert len(places) == 2
 
 
 def test_paths_are_quoted_for_the_database() -> None:

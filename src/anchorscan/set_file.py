@@ -317,7 +317,10 @@ class SetFile:
                 if _load_build(connection) != after:
                     raise ReferenceSetError(f"{self.path}: another build is writing to this set")
                 _store_build(connection, build)
-            references = number(places, header.next_identifier)
+            try:
+                references = number(places, header.next_identifier)
+            except ReferenceSetError as error:
+                raise ReferenceSetError(f"{self.path}: {error}") from None
             _store_references(connection, header, references)
         return references
 
@@ -433,8 +436,14 @@ class SetFile:
             raise
 
 
-def number(places: Iterable[Place], first: int) -> list[Reference]:
-    """Make references of places, with identifiers that rise from ``first``."""
+def number(places: Sequence[Place], first: int) -> list[Reference]:
+    """Make references of places, with identifiers that rise from ``first``.
+
+    Raises:
+        ReferenceSetError: There are not so many identifiers.
+    """
+    if first + len(places) > _LAST_IDENTIFIER:
+        raise ReferenceSetError("no number is left for another reference of this set")
     return [
         Reference(first + i, place.scan, place.pose, place.name) for i, place in enumerate(places)
     ]

@@ -354,7 +354,8 @@ def _sealed(data: bytes, folder: Path) -> None:
         except (sqlite3.Error, OverflowError):  # NaN is NULL to SQLite, and not allowed there
             return
         text = settings.decode("utf-8", "replace")
-        _store_header(connection, _Header(title, text, max(0, identifier + 1), 1, seal))
+        following = max(0, min(identifier, (1 << 63) - 2) + 1)  # what SQLite can hold
+        _store_header(connection, _Header(title, text, following, 1, seal))
         connection.execute("COMMIT")
     try:
         with ReferenceSet.open(path) as places:
