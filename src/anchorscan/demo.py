@@ -43,6 +43,8 @@ _INK, _WALL = "#222222", "#8a8a8a"
 _RIGHT, _WRONG, _UNKNOWN = "#0072b2", "#d55e00", "#cc79a7"
 _MARGIN = 4.0
 _NOSE = 1.5
+# Farther off than this, metres, is another place.
+_ANOTHER_PLACE = 5.0
 _CUT = 2.0
 _ASPECT = 1.35
 
@@ -264,7 +266,7 @@ def _to_show(outcome: Demonstration) -> list[tuple[Located, str]]:
     """Choose a scan that was located from a distance, and one that was rightly not believed."""
     hits = [each for each in outcome.located if each.answer.accepted and each.answer.is_correct]
     silent = [each for each in outcome.located if each.best and not each.answer.accepted]
-    misses = [each for each in silent if not each.answer.is_correct]
+    misses = [each for each in silent if each.answer.position_error > _ANOTHER_PLACE]
     chosen = []
     if hits:
         best = max(hits, key=_interest)
