@@ -3,11 +3,11 @@
     python examples/equal_places.py LOG [--later LOG] [--queries N] [--range-max M]
 
 References and queries by protocol P1, or by P3 with a later drive; the same references once more,
-carried off and turned.  Of the scans that are answered without the copy: how far apart the scores
-of the two places are, in the root mean square; how many are answered with the copy, which nothing
-can be sure of, for the width of noise that is shipped (``decision.twins``) and for others; how many
-are ambiguous, and of how many both places are named.  Last, how many are lost without any copy,
-compared with no width at all.
+carried off and turned.  For the width of noise that is shipped (``decision.twins``) and for others:
+how many scans are answered alone, without the copy, which is fewer than without any width by what
+the width costs.  Of those that are answered alone without any width: how many are answered with
+the copy, which nothing can be sure of; how many are ambiguous then, and of how many both places
+are named; and how far apart the scores of the two places are, in the root mean square.
 """
 
 from __future__ import annotations
@@ -16,33 +16,55 @@ import argparse
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import islice
 
-from anchorscan import Hypothesis, LaserScan, Matcher, Pose2D, Reference, Settings
+import numpy as np
+
+from anchorscan import LaserScan, Matcher, Pose2D, Reference, Settings
 from anchorscan.benchmark import read_drives, tasks
+from anchorscan.decision import Decision, decide
+from anchorscan.description import describe
+from anchorscan.verification import FEATURES, Fits
 
 AWAY = Pose2D(300.0, -150.0, 1.0)
 NOTHING = 1e-9
+WIDTHS = (NOTHING, 0.005, 0.012, 0.018)
 NEAR = 0.5
+SETTINGS = Settings.preset("default")
 
 
 @dataclass(frozen=True)
-class Told:
-    """What one width of noise makes of the scans.
+class Asked:
+    """What was found for one scan.
 
     Args:
-        alone: Answered without the copy.
-        doubled: Of those that no width at all answers without the copy, answered with it.
-        ambiguous: Of the same, ambiguous with it.
-        both: Of these, with both places named.
-        difference: Of the scores of the two places, root mean square.
+        anchors: How many anchor points it has.
+        once: Fits in the map.
+        twice: Fits in the map with the copy.
     """
 
-    alone: int
-    doubled: int
-    ambiguous: int
-    both: int
-    difference: float
+    anchors: int
+    once: Fits
+    twice: Fits
+
+    def alone(self, width: float) -> Decision:
+        """Decide without the copy."""
+        return decided(self.once, self.anchors, width)
+
+    def doubled(self, width: float) -> Decision:
+        """Decide with the copy."""
+        return decided(self.twice, self.anchors, width)
+
+    @cached_property
+    def places(self) -> list[int]:
+        """Ranks with the copy of the place that is best without it, and of its copy."""
+        best = Pose2D(*self.once.poses[0])
+        found = [Pose2D(*pose) for pose in self.twice.poses]
+        near = (
+            [k for k, p in enumerate(found) if p.distance(at) < NEAR] for at in (best, AWAY @ best)
+        )
+        return [ranks[0] for ranks in near if ranks]
 
 
 def main() -> None:
@@ -56,43 +78,44 @@ def main() -> None:
     logs = [log for log in (arguments.log, arguments.later) if log]
     protocol = "P3" if arguments.later else "P1"
     (task,) = islice(tasks(read_drives(logs, arguments.range_max), (protocol,)), 1)
-    asked = [scan for scan, _ in task.queries]
-    asked = asked[:: max(1, len(asked) // arguments.queries)]
+    scans = [scan for scan, _ in task.queries]
+    scans = scans[:: max(1, len(scans) // arguments.queries)]
+    asked = searched(task.references, scans)
+    sure = [each for each in asked if each.alone(NOTHING).accepted]
+    both = [each for each in sure if len(each.places) == 2]
+    apart = [np.diff(each.twice.features[each.places, FEATURES.index("score")]) for each in both]
+    difference = math.sqrt(float(np.mean(np.square(apart)))) if apart else math.nan
     print(" width  asked  alone  doubled  ambiguous  both named  difference")
-    for width in (NOTHING, 0.005, 0.012, 0.018):
-        told = measured(task.references, asked, width)
+    for width in WIDTHS:
+        alone = sum(each.alone(width).accepted for each in asked)
+        told = [(each, each.doubled(width)) for each in sure]
+        answered = sum(decision.accepted for _, decision in told)
+        ambiguous = sum(decision.is_ambiguous(0) for _, decision in told)
+        named = sum(
+            len(each.places) == 2 and all(map(decision.is_ambiguous, each.places))
+            for each, decision in told
+        )
         print(
-            f"{width:>6.3f} {len(asked):>6} {told.alone:>6} {told.doubled:>8} "
-            f"{told.ambiguous:>10} {told.both:>11} {told.difference:>11.4f}"
+            f"{width:>6.3f} {len(scans):>6} {alone:>6} {answered:>8} "
+            f"{ambiguous:>10} {named:>11} {difference:>11.4f}"
         )
 
 
-def measured(references: Sequence[Reference], asked: Sequence[LaserScan], width: float) -> Told:
-    """Ask scans with and without a copy of the references."""
-    loose = Matcher(references, with_width(NOTHING))
-    once, twice = (Matcher(each, with_width(width)) for each in (references, doubled(references)))
-    alone, answered, ambiguous, both, squares = 0, 0, 0, 0, []
-    for scan in asked:
-        without = once.locate(scan)
-        alone += bool(without) and without[0].accepted
-        best = loose.locate(scan)[:1]
-        if not best or not best[0].accepted:
-            continue
-        found = twice.locate(scan)
-        answered += found[0].accepted
-        ambiguous += found[0].ambiguous
-        named = [each for each in found if each.ambiguous]
-        here, there = at(best[0].pose, found), at(copied(best[0].pose), found)
-        both += here in named and there in named
-        if here is not None and there is not None:
-            squares.append((here.score - there.score) ** 2)
-    difference = math.sqrt(sum(squares) / len(squares)) if squares else math.nan
-    return Told(alone, answered, ambiguous, both, difference)
+def searched(references: Sequence[Reference], scans: Sequence[LaserScan]) -> list[Asked]:
+    """Search for scans with and without a copy of the references."""
+    once, twice = Matcher(references, SETTINGS), Matcher(doubled(references), SETTINGS)
+    asked = []
+    for scan in scans:
+        description = describe(scan, SETTINGS)
+        alone, both = once.fits(description), twice.fits(description)
+        if alone and both:
+            asked.append(Asked(len(description.anchors), alone, both))
+    return asked
 
 
-def with_width(width: float) -> Settings:
-    """Return the shipped settings but for the noise of equal places."""
-    return Settings.preset("default").changed({"decision": {"twins": width}})
+def decided(fits: Fits, anchors: int, width: float) -> Decision:
+    """Decide as shipped, but for the noise of equal places."""
+    return decide(fits, anchors, SETTINGS.decision.model_copy(update={"twins": width}))
 
 
 def doubled(references: Sequence[Reference]) -> list[Reference]:
@@ -108,13 +131,6 @@ def copied(pose: Pose2D | None) -> Pose2D:
     """Return where a pose is in the copy."""
     assert pose is not None
     return AWAY @ pose
-
-
-def at(pose: Pose2D | None, found: Sequence[Hypothesis]) -> Hypothesis | None:
-    """Return the first hypothesis at a place, if there is one."""
-    assert pose is not None
-    near = (each for each in found if each.pose is not None and each.pose.distance(pose) < NEAR)
-    return next(near, None)
 
 
 if __name__ == "__main__":

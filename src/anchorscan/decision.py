@@ -144,6 +144,10 @@ class Decision:
         """Whether the first is an answer."""
         return self.alike == 1
 
+    def is_ambiguous(self, rank: int) -> bool:
+        """Tell whether the fit of a rank is one of several that explain the scan alike."""
+        return rank < self.alike and not self.accepted
+
 
 def evidence(fits: Fits, anchors: int) -> NDArray[np.float64]:
     """Return the (6,) numbers that speak for the best fit: 1 and those of the module's text.
@@ -250,11 +254,10 @@ def beside(fits: Fits, settings: DecisionSettings) -> float:
 @kernel
 def _decided(features, hessians, residuals, counts, weights, deviations, others, answer):  # type: ignore[no-untyped-def]
     """Probability of each fit, of none of them, and how many of the first are alike."""
-    heading = hessians[0, 2, 2]
     known = held(_covariances(hessians[:1], residuals[:1], deviations)[0])
     threshold, most, twins = answer
-    best = known * _place(_evidence(features, 1, heading, counts), weights)
-    best = min(best, _beside(features, 1, twins))
+    told = (hessians[0, 2, 2], counts, weights, known, twins)
+    best = _likely(features, 1, told)
     alone, alike = best, 1
     while (
         alone < threshold
@@ -262,14 +265,21 @@ def _decided(features, hessians, residuals, counts, weights, deviations, others,
         and _beside(features[: alike + 1], alike, twins) < threshold
     ):
         alike += 1
-        alone = known * _place(_evidence(features, alike, heading, counts), weights)
-        alone = min(alone, _beside(features, alike, twins))
+        alone = _likely(features, alike, told)
     if alone < threshold:
         alone, alike = best, 0
     shared, elsewhere = _shared(
         (best, alone, max(alike, 1)), _worths(features), worth(others[0], 0.0), others[1]
     )
     return shared, elsewhere, alike
+
+
+@kernel
+def _likely(features, second, told):  # type: ignore[no-untyped-def]
+    """Probability of the best fit beside those from rank ``second`` on."""
+    heading, counts, weights, known, twins = told
+    place = _place(_evidence(features, second, heading, counts), weights)
+    return min(known * place, _beside(features, second, twins))
 
 
 @kernel

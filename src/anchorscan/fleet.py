@@ -263,7 +263,7 @@ def decide_over(
             fits[rank : rank + 1],
             float(decision.probabilities[rank]),
             decision.accepted and rank == 0,
-            not decision.accepted and rank < decision.alike,
+            decision.is_ambiguous(rank),
         )
         for rank, (each, _) in enumerate(best)
     ]

@@ -43,10 +43,10 @@ def ascending(values):  # type: ignore[no-untyped-def]
     order = np.empty(count, np.int64)
     bins = np.zeros(count, np.int64)
     starts = np.zeros(count + 1, np.int64)
-    if count > 0 and values.min() < values.max():
-        least, span = values.min(), values.max() - values.min()
-        for i in range(count):
-            bins[i] = int((values[i] - least) / span * (count - 1))
+    least = values.min() if count > 0 else 0.0
+    span = values.max() - least if count > 0 else 0.0
+    for i in range(count if span > 0.0 else 0):
+        bins[i] = int((values[i] - least) / span * (count - 1))
     for i in range(count):
         starts[bins[i] + 1] += 1
     for k in range(count):

@@ -16,13 +16,13 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from .errors import ScanError
-from .hypothesis import Hypothesis
+from .hypothesis import Hypothesis, state_of
 from .pose import Pose2D
 from .scan import LaserScan
 
@@ -36,6 +36,7 @@ __all__ = [
     "pose_values",
     "scan_of",
     "scan_values",
+    "state_values",
     "unpacked",
 ]
 
@@ -135,6 +136,12 @@ def hypothesis_values(hypothesis: Hypothesis) -> dict[str, Any]:
         "accepted": hypothesis.accepted,
         "ambiguous": hypothesis.ambiguous,
     }
+
+
+def state_values(hypotheses: Sequence[Hypothesis]) -> dict[str, Any]:
+    """Return as JSON what the hypotheses of one scan amount to."""
+    state = state_of(hypotheses)
+    return {"accepted": state == "located", "state": state}
 
 
 def hypothesis_of(values: Mapping[str, Any]) -> Hypothesis:

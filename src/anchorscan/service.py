@@ -38,10 +38,9 @@ from pydantic_core import to_json
 
 from .errors import AnchorscanError, MissingExtraError, ScanError, SettingsError
 from .fleet import BuildingHypothesis
-from .hypothesis import state_of
 from .reference_set import ReferenceSet
 from .scan import LaserScan
-from .scan_message import BINARY, hypothesis_values, unpacked
+from .scan_message import BINARY, hypothesis_values, state_values, unpacked
 from .service_message import (
     AddedOut,
     BatchIn,
@@ -550,8 +549,7 @@ def _locate(
         found = kept.places.locate(scan)
         answers.append(
             {
-                "accepted": bool(found) and found[0].accepted,
-                "state": state_of(found),
+                **state_values(found),
                 "seconds": time.perf_counter() - start,
                 "hypotheses": [hypothesis_values(each) for each in found],
             }
@@ -564,8 +562,7 @@ def _which(scan: LaserScan, shelf: Shelf, _: float) -> dict[str, Any]:
     start = time.perf_counter()
     found = fleet.locate(scan)
     return {
-        "accepted": bool(found) and found[0].hypothesis.accepted,
-        "state": state_of([each.hypothesis for each in found]),
+        **state_values([each.hypothesis for each in found]),
         "seconds": time.perf_counter() - start,
         "sets": len(fleet),
         "hypotheses": [_named(each, versions) for each in found],

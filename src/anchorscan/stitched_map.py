@@ -369,7 +369,7 @@ class StitchedMap:
                 score=scores[n],
                 probability=probabilities[n],
                 accepted=decision.accepted and n == 0,
-                ambiguous=n < decision.alike and not decision.accepted,
+                ambiguous=decision.is_ambiguous(n),
             )
             for n, each in enumerate(known)
         )

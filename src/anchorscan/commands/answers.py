@@ -173,7 +173,7 @@ class _Locator:
 
     def line(self, record: Record) -> dict[str, Any]:
         """Return the line of ``locate`` for a record."""
-        from ..hypothesis import state_of
+        from ..scan_message import state_values
 
         hypotheses: list[Hypothesis] = []
         start = time.perf_counter()
@@ -184,8 +184,7 @@ class _Locator:
             "scan": record.index,
             "stamp": record.stamp,
             "seconds": round(seconds, _DECIMALS + 1),
-            "accepted": bool(hypotheses) and hypotheses[0].accepted,
-            "state": state_of(hypotheses),
+            **state_values(hypotheses),
             "hypotheses": [_hypothesis_line(hypothesis) for hypothesis in hypotheses],
         }
         if not hypotheses:
@@ -252,8 +251,8 @@ def _which_lines(fleet: SpreadFleet, records: Iterable[Record]) -> Iterator[dict
     """Yield the line of ``which`` for every record; its time is that since the one before."""
     import numpy as np
 
-    from ..hypothesis import state_of
     from ..scan import LaserScan
+    from ..scan_message import state_values
 
     nothing = LaserScan(np.empty(0, np.float32), 0.0, 1.0)
     kept, asked = tee(records)
@@ -264,8 +263,7 @@ def _which_lines(fleet: SpreadFleet, records: Iterable[Record]) -> Iterator[dict
             "scan": record.index,
             "stamp": record.stamp,
             "seconds": round(time.perf_counter() - start, _DECIMALS + 1),
-            "accepted": bool(found) and found[0].hypothesis.accepted,
-            "state": state_of([each.hypothesis for each in found]),
+            **state_values([each.hypothesis for each in found]),
             "hypotheses": [
                 {"building": each.building, **_hypothesis_line(each.hypothesis)} for each in found
             ],
