@@ -252,17 +252,20 @@ def read_index(path: Path, settings: Settings) -> DerivedIndex | None:
     """
     target = index_path(path)
     arrays = read_arrays(target, _made_of(settings))
-    if arrays is None:
+    try:
+        return None if arrays is None else _index_of(arrays, target.stat().st_size)
+    except OSError:
         return None
+
+
+def _index_of(arrays: Mapping[str, NDArray[Any]], size: int) -> DerivedIndex | None:
+    """Take arrays for an index, if they are what it has and fit each other."""
     try:
         index = DerivedIndex(
-            arrays,
-            arrays["references.identifiers"],
-            arrays["references.checksums"],
-            target.stat().st_size,
+            arrays, arrays["references.identifiers"], arrays["references.checksums"], size
         )
         _check_references(arrays, len(index.identifiers))
-    except (KeyError, OSError, ValueError, TypeError, IndexError):
+    except (KeyError, ValueError, TypeError, IndexError):
         return None
     return index
 

@@ -279,10 +279,10 @@ EDIT = struct.Struct("<BBHHq")
 
 def index_edits() -> list[bytes]:
     """Changes of the arrays of an index: none, and a value of every kind in every array."""
-    found = [b"\0", b"\1"]
+    found = [bytes([first]) for first in range(12)]  # of both kinds, whatever is done then
     for how in range(9):
-        found += [bytes([n & 1]) + EDIT.pack(n, how, 3, 2, -1) for n in range(24)]
-    found += [b"\0" + EDIT.pack(n, 0, 3, 2, WORST[n % len(WORST)]) for n in range(24)]
+        found += [bytes([2 + (n + how) % 10]) + EDIT.pack(n, how, 3, 2, -1) for n in range(34)]
+    found += [bytes([2 + n % 10]) + EDIT.pack(n, 0, 3, 2, WORST[n % len(WORST)]) for n in range(34)]
     return found
 
 

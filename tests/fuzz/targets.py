@@ -49,7 +49,7 @@ from anchorscan import (
 )
 from anchorscan.answers import read_runs
 from anchorscan.array_file import read_arrays, write_arrays
-from anchorscan.derived_index import _made_of, index_path
+from anchorscan.derived_index import _index_of, _made_of, index_path
 from anchorscan.io import _tum_file
 from anchorscan.io.log import Report
 from anchorscan.io.posed_log import PosedLog
@@ -442,35 +442,87 @@ def _edited(arrays: dict[str, np.ndarray], edit: bytes) -> None:
 def _index(data: bytes, folder: Path) -> None:
     """An index that was crafted with care: every checksum is right, the numbers are not.
 
-    It must be left alone, or serve: whatever happens to the set then, it holds.
+    It must be left alone, or serve: whatever happens to the set then, it holds.  Most inputs spare
+    the files, which other targets are for, and do one thing with the index, so that many can be
+    tried; some do all that a program could, with files.
     """
-    kind = data[:1] > b"\x7f" or data[:1] == b"\1"
-    content, sound = _indexed(int(kind))
+    first = data[0] if data else 0
+    kind, deed = first & 1, (first >> 1) % (3 * len(_DEEDS) + 1)
+    content, sound = _indexed(kind)
     arrays = {name: array.copy() for name, array in sound.items()}
     for at in range(1, len(data), seeds.EDIT.size):
         if arrays:
             _edited(arrays, data[at : at + seeds.EDIT.size])
+    try:
+        if deed:
+            _serve_arrays(arrays, kind, _DEEDS[deed % len(_DEEDS)])
+        else:
+            _serve_file(content, arrays, kind, folder)
+    except AnchorscanError as error:
+        _one_line(error)
+
+
+def _serve_arrays(
+    arrays: dict[str, np.ndarray], kind: int, deed: Callable[[Matcher], None]
+) -> None:
+    """Take arrays as they are taken from a file, and do one thing with them."""
+    index = _index_of(arrays, 0)
+    if index is None:
+        return
+    try:
+        matcher = Matcher.from_arrays(index.arrays, _INDEXED[kind], index.read)
+    except (ValueError, KeyError, IndexError):  # the set is read without its index then
+        return
+    deed(matcher)
+
+
+def _ask(matcher: Matcher, candidates: int | None = None) -> None:
+    for hypothesis in matcher.locate(_rooms()[0].scan, candidates):
+        _check_hypothesis(hypothesis)
+
+
+def _ask_voted(matcher: Matcher) -> None:
+    _ask(matcher, 1)
+
+
+def _add_and_ask(matcher: Matcher) -> None:
+    matcher.add(Reference(1 << 40, _rooms()[0].scan, Pose2D(20.0, 3.0, 1.0)))
+    _ask(matcher)
+
+
+def _remove_and_ask(matcher: Matcher) -> None:
+    with contextlib.suppress(KeyError):
+        matcher.remove(0)
+    _ask(matcher)
+
+
+def _store_again(matcher: Matcher) -> None:
+    matcher.arrays()
+
+
+_DEEDS = (_ask, _ask_voted, _add_and_ask, _remove_and_ask, _store_again)
+
+
+def _serve_file(content: bytes, arrays: dict[str, np.ndarray], kind: int, folder: Path) -> None:
+    """Open a set with an index of such arrays, ask it, and change it."""
     path = folder / "indexed.apr"
     path.write_bytes(content)
     room = dict.fromkeys(("field.codes", "field.coarse"), 8)
     write_arrays(index_path(path), arrays, _made_of(_INDEXED[kind]), room)
     asked = _rooms()[0].scan
-    try:
-        with ReferenceSet.open(path, settings=_INDEXED[kind]) as places:  # not read every time
-            places._matcher = places._indexed()
-            if places._matcher is None:  # without its index the set is the same every time
-                _check_set(places)
-                return
-            for candidates in (None, 1):
-                for hypothesis in places.locate(asked, candidates):
-                    _check_hypothesis(hypothesis)
+    with ReferenceSet.open(path, settings=_INDEXED[kind]) as places:  # not read every time
+        places._matcher = places._indexed()
+        if places._matcher is None:  # without its index the set is the same every time
             _check_set(places)
-            places.add(asked, Pose2D(20.0, 3.0, 1.0))
-            places.remove(0)
-            for hypothesis in places.locate(asked):
+            return
+        for candidates in (None, 1):
+            for hypothesis in places.locate(asked, candidates):
                 _check_hypothesis(hypothesis)
-    except AnchorscanError as error:
-        _one_line(error)
+        _check_set(places)
+        places.add(asked, Pose2D(20.0, 3.0, 1.0))
+        places.remove(0)
+        for hypothesis in places.locate(asked):
+            _check_hypothesis(hypothesis)
 
 
 def _directory(data: bytes, folder: Path) -> None:
