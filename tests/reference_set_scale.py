@@ -109,15 +109,17 @@ def ask(path: Path) -> None:
         right += best.pose.distance(reference.pose) < 0.5
     tell("answer", spent)
     print(f"of {ASKED} scans {right} were placed there, the others at their likes", flush=True)
-    change(places, identifiers)
+    change(places, identifiers[:CHANGED], ", each elsewhere")
+    first = len(places) // 2
+    change(places, list(range(first, min(first + CHANGED, len(places)))), ", along one drive")
     print(f"memory: {memory():.0f} MB")
 
 
-def change(places: ReferenceSet, identifiers: list[int]) -> None:
+def change(places: ReferenceSet, identifiers: list[int], where: str) -> None:
     """Add and remove in memory: with a file the disk's own time comes on top, once a batch."""
     matcher, added, removed = places._prepared(), [], []
-    others = [places[identifier] for identifier in identifiers[:CHANGED]]
-    first = places.info().next_identifier if len(places) < PROPOSING else 1 << 40
+    others = [places[identifier] for identifier in identifiers]
+    first = 1 << 40
     for k, reference in enumerate(others):
         again = type(reference)(first + k, reference.scan, reference.pose)
         begin = time.process_time()
@@ -127,8 +129,8 @@ def change(places: ReferenceSet, identifiers: list[int]) -> None:
         begin = time.process_time()
         matcher.remove(first + k)
         removed.append(1e3 * (time.process_time() - begin))
-    tell("add", added)
-    tell("remove", removed)
+    tell(f"add{where}", added)
+    tell(f"remove{where}", removed)
 
 
 def tell(what: str, spent: list[float]) -> None:

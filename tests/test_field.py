@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 import threading
+import zlib
 from collections import Counter, defaultdict
 
 import numpy as np
@@ -23,6 +24,7 @@ from anchorscan import (
     simulate,
 )
 from anchorscan import field as field_module
+from anchorscan.evidence import SIDE
 from anchorscan.field import FieldSettings, LikelihoodField
 from anchorscan.rays import passed_through
 from anchorscan.refinement import _solved as solved
@@ -626,3 +628,61 @@ def test_evidence_that_is_packed_and_opened_again_is_the_same(monkeypatch):
     for scan, pose in others:
         field.add(scan, pose)
     assert all_bytes(field) == expected
+
+
+def layers_of(rng, most):
+    """Evidence of a tile: few cells with readings that ended there, passes up to a number."""
+    hits, x, y = np.zeros((3, SIDE * SIDE), np.int32)
+    at = rng.choice(SIDE * SIDE, 200, replace=False)
+    hits[at] = rng.integers(0, 9, 200)
+    x[at], y[at] = rng.integers(0, 2000, (2, 200))
+    return hits, x, y, rng.integers(0, most + 1, SIDE * SIDE).astype(np.int32)
+
+
+@pytest.mark.parametrize("most", [0, 1, 255, 256, 1 << 20])
+def test_packed_evidence_is_unpacked_to_the_number(most):
+    layers = layers_of(np.random.default_rng(most), most)
+    again = np.zeros((4, SIDE * SIDE), np.int32)
+    evidence._unpack(evidence._packed(*layers), *again)
+    np.testing.assert_array_equal(again, layers)
+
+
+def test_a_cell_with_every_number_in_it_is_packed():
+    extremes = np.array([-(1 << 31), -1, 0, 1, (1 << 31) - 1], np.int32)
+    layers = np.random.default_rng(3).choice(extremes, (4, SIDE * SIDE)).astype(np.int32)
+    again = np.zeros_like(layers)
+    evidence._unpack(evidence._packed(*layers), *again)
+    np.testing.assert_array_equal(again, layers)
+
+
+def test_evidence_of_nothing_takes_nothing():
+    assert evidence._packed(*np.zeros((4, SIDE * SIDE), np.int32)) == b""
+
+
+def damaged_evidence():
+    hit = np.arange(3, dtype="<u2").tobytes() + bytes(36)
+    passes = bytes(SIDE * SIDE)
+    yield "cut", zlib.compress(b"\3\0" + hit + passes)[:-2]
+    yield "short", zlib.compress(b"\3\0" + hit + passes[1:])
+    yield "long", zlib.compress(b"\3\0" + hit + passes + b"\0")
+    yield "more cells than there are", zlib.compress(b"\xff\xff" + hit + passes)
+    yield "a cell beyond the tile", zlib.compress(b"\1\0\0\x10" + bytes(12) + passes)
+    yield "a cell twice", zlib.compress(b"\2\0\5\0\5\0" + bytes(24) + passes)
+    yield "a bomb", zlib.compress(bytes(1 << 24))
+
+
+@pytest.mark.parametrize("data", [pytest.param(d, id=what) for what, d in damaged_evidence()])
+def test_damaged_evidence_is_said(data):
+    layers = np.zeros((4, SIDE * SIDE), np.int32)
+    with pytest.raises(AnchorscanError, match="damaged"):
+        evidence._unpack(data, *layers)
+    assert not layers.any()
+
+
+def test_damaged_evidence_is_said_again_when_it_is_opened_again():
+    square = np.zeros((1, 2), np.int64)
+    stored = np.frombuffer(b"no evidence", np.uint8)
+    tiles = evidence.TileEvidence(square.astype(np.int32), stored, np.array([0, len(stored)]))
+    for _ in range(2):
+        with pytest.raises(AnchorscanError, match="damaged"):
+            tiles.rows(square, make=True)

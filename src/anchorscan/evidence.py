@@ -6,6 +6,10 @@ passed.  Integers make adding and removing exact opposites, in any order.
 Only a change of the map looks at evidence, and only at that of a few tiles.  So a tile is
 *open*, as arrays that kernels change, only while there are few; others are kept packed, a
 hundredth of the size, and so they are stored.
+
+Packed are, compressed by zlib and little endian: the number of cells in which readings ended
+(uint16), which these are (uint16, ascending), their hits, x and y (int32, one behind the other),
+and the passes of all cells, as uint8 or, where one does not fit, as int32.
 """
 
 from __future__ import annotations
@@ -25,7 +29,12 @@ SIDE = 64
 """Cells along a side of a tile."""
 
 _LAYERS = 4
-_BYTES = _LAYERS * SIDE * SIDE * 4
+_CELLS = SIDE * SIDE
+_COUNT, _PLACE, _SUM = np.dtype("<u2"), np.dtype("<u2"), np.dtype("<i4")
+_PER_HIT = _PLACE.itemsize + 3 * _SUM.itemsize
+# Passes in bytes, and what is taken where they do not fit.
+_FEW, _MANY = np.dtype("<u1"), np.dtype("<i4")
+_MOST_BYTES = _COUNT.itemsize + _CELLS * (_PER_HIT + _MANY.itemsize)
 # More open tiles than this, an eighth of a gigabyte, are packed.
 _MOST_OPEN = 2048
 # The quickest level: higher ones take several times as long for a tenth less.
@@ -133,10 +142,9 @@ class TileEvidence:
             self._close(set(wanted))
         self._make_room(len(begun))
         for key, data in begun.items():
-            row = self._open[key] = len(self._open) + 1
-            unpacked = _unpacked(data)
-            for layer, values in zip(self._layers, unpacked, strict=True):
-                layer[row] = values
+            row = len(self._open) + 1
+            _unpack(data, *(layer[row].reshape(-1) for layer in self._layers))
+            self._open[key] = row
 
     def _close(self, wanted: set[int]) -> None:
         """Pack all open tiles but those that are wanted, and move these together."""
@@ -145,8 +153,9 @@ class TileEvidence:
             if key not in wanted and key in self._changed:
                 self._packed[key] = self._pack(row)
                 self._changed.remove(key)
-        rows = [0, *(self._open[key] for key in kept)]
-        self._layers = Evidence(*(layer[rows] for layer in self._layers))
+        rows = [self._open[key] for key in kept]
+        for layer in self._layers:  # whose pages are in memory by now
+            layer[1 : 1 + len(kept)] = layer[rows]
         self._open = {key: row for row, key in enumerate(kept, 1)}
 
     def _make_room(self, count: int) -> None:
@@ -176,8 +185,25 @@ class TileEvidence:
         return None
 
     def _pack(self, row: int) -> bytes:
-        values = np.stack([layer[row] for layer in self._layers]).astype("<i4", copy=False)
-        return zlib.compress(values.tobytes(), _LEVEL) if values.any() else _NOTHING
+        return _packed(*(layer[row].reshape(-1) for layer in self._layers))
+
+
+def _packed(
+    hits: NDArray[np.int32], x: NDArray[np.int32], y: NDArray[np.int32], passes: NDArray[np.int32]
+) -> bytes:
+    """Pack (4096,) evidence of a tile."""
+    at = np.flatnonzero(hits | x | y)
+    least, most = int(passes.min()), int(passes.max())
+    if not (len(at) or least or most):
+        return _NOTHING
+    kind = _FEW if least >= 0 and most <= np.iinfo(_FEW).max else _MANY
+    parts = (
+        np.array(len(at), _COUNT),
+        at.astype(_PLACE),
+        np.stack([hits[at], x[at], y[at]]).astype(_SUM),
+        passes.astype(kind),
+    )
+    return zlib.compress(b"".join(part.tobytes() for part in parts), _LEVEL)
 
 
 def _keys(squares: NDArray[np.int32] | NDArray[np.int64]) -> NDArray[np.int64]:
@@ -186,15 +212,41 @@ def _keys(squares: NDArray[np.int32] | NDArray[np.int64]) -> NDArray[np.int64]:
     return (rows << 32) + columns
 
 
-def _unpacked(data: bytes) -> NDArray[np.int32]:
-    """(4, 64, 64) evidence of a tile."""
-    if not data:
-        return np.zeros((_LAYERS, SIDE, SIDE), np.int32)
+def _unpack(
+    packed: bytes,
+    hits: NDArray[np.int32],
+    x: NDArray[np.int32],
+    y: NDArray[np.int32],
+    passes: NDArray[np.int32],
+) -> None:
+    """Lay packed evidence out, (4096,) each.
+
+    Raises:
+        AnchorscanError: It is damaged.
+    """
+    for layer in (hits, x, y, passes):
+        layer[:] = 0
+    if not packed:
+        return
     unpack = zlib.decompressobj()
     try:
-        values = unpack.decompress(data, _BYTES + 1)
+        data = unpack.decompress(packed, _MOST_BYTES + 1)
     except zlib.error as error:
-        raise AnchorscanError(f"the stored evidence of the map is damaged: {error}") from None
-    if len(values) != _BYTES or not unpack.eof:
-        raise AnchorscanError("the stored evidence of the map is damaged: it has another size")
-    return np.frombuffer(values, "<i4").reshape(_LAYERS, SIDE, SIDE)
+        raise _damaged(str(error)) from None
+    if not unpack.eof or len(data) < _COUNT.itemsize:
+        raise _damaged("it has another size")
+    count = int(np.frombuffer(data, _COUNT, 1)[0])
+    sums = _COUNT.itemsize + count * _PLACE.itemsize
+    rest = _COUNT.itemsize + count * _PER_HIT
+    kinds = {_CELLS * kind.itemsize: kind for kind in (_FEW, _MANY)}
+    if len(data) - rest not in kinds:
+        raise _damaged("it has another size")
+    at = np.frombuffer(data, _PLACE, count, _COUNT.itemsize)
+    if count and (at[-1] >= _CELLS or np.any(at[1:] <= at[:-1])):
+        raise _damaged("its cells are in no order")
+    hits[at], x[at], y[at] = np.frombuffer(data, _SUM, 3 * count, sums).reshape(3, count)
+    passes[:] = np.frombuffer(data, kinds[len(data) - rest], _CELLS, rest)
+
+
+def _damaged(what: str) -> AnchorscanError:
+    return AnchorscanError(f"the stored evidence of the map is damaged: {what}")

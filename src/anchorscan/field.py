@@ -153,6 +153,7 @@ class LikelihoodField:
             touched, _ = self._deposit(rays, 1)
             stale.update(map(tuple, touched.tolist()))
         squares = np.array(sorted(stale), np.int64).reshape(-1, 2)
+        self._make_room(len(squares))  # at once: growing copies, and leaves room that nobody needs
         self._derive_all(squares, np.full((len(squares), 2), _ALL_BLOCKS, np.uint64))
         self._publish()
 
@@ -244,8 +245,8 @@ class LikelihoodField:
             squares[told].astype(np.int32),
             evidence,
             np.append(starts[:-1][told], starts[-1]),
-            self._coarse[numbers],
-            self._codes[numbers],
+            _rows(self._coarse, numbers),
+            _rows(self._codes, numbers),
         )
 
     def add(self, scan: LaserScan, pose: Pose2D) -> None:
@@ -474,6 +475,13 @@ def _check_pose(pose: Pose2D) -> None:
     away = max(abs(pose.x), abs(pose.y))
     if away > _FARTHEST:
         raise AnchorscanError(f"a reference lies {away / 1e3:.3g} km away; is its pose wrong?")
+
+
+def _rows(layer: NDArray, numbers: NDArray[np.int64]) -> NDArray:  # type: ignore[type-arg]
+    """Rows of a layer by their numbers: the layer itself where they are its first ones."""
+    is_first = np.array_equal(numbers, np.arange(len(numbers)))
+    rows: NDArray = layer[: len(numbers)] if is_first else layer[numbers]  # type: ignore[type-arg]
+    return rows
 
 
 def _grown(layer: NDArray, room: int) -> NDArray:  # type: ignore[type-arg]

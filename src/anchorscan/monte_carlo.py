@@ -141,7 +141,8 @@ class MonteCarlo:
         )
 
     def _weigh(self, scan: LaserScan) -> None:
-        beams = scan.points[:: max(len(scan.points) // _BEAMS, 1)]
+        points = scan.points
+        beams = points[:: max(len(points) // _BEAMS, 1)]
         frame = np.append(self._origin[:2], self._resolution)
         likelihood = _likelihood(self._poses, beams, self._field, frame)
         weights = self._weights * likelihood

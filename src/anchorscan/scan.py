@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -119,8 +118,9 @@ class LaserScan:
         every = int(1.000001 * increment / (abs(self.angle_increment) or math.inf))
         if every < 2 or not len(self.ranges):
             return self
+        is_return = self.is_return
         begins = range(min(every, len(self.ranges)))
-        begin = max(begins, key=lambda k: np.count_nonzero(self.is_return[k::every]))
+        begin = max(begins, key=lambda k: np.count_nonzero(is_return[k::every]))
         return LaserScan(
             self.ranges[begin::every],
             self.angle_min + begin * self.angle_increment,
@@ -129,13 +129,13 @@ class LaserScan:
             self.range_max,
         )
 
-    @cached_property
+    @property
     def angles(self) -> NDArray[np.float64]:
         """(N,) direction of every reading, radians, scan frame."""
         readings = np.arange(len(self.ranges), dtype=np.float64)
         return self.angle_min + self.angle_increment * readings
 
-    @cached_property
+    @property
     def is_return(self) -> NDArray[np.bool_]:
         """(N,) whether the reading hit something within the limits."""
         ranges = self.ranges
@@ -152,17 +152,18 @@ class LaserScan:
         """Longest range of a return, metres: ``range_max`` as a reading holds it, or 10 km."""
         return float(np.float32(min(self.range_max, _LONGEST)))
 
-    @cached_property
+    @property
     def is_free(self) -> NDArray[np.bool_]:
         """(N,) whether the reading found nothing within reach (REP-117 ``+inf``)."""
         with np.errstate(invalid="ignore", over="ignore"):
             return np.asarray(self.ranges > self.range_max)
 
-    @cached_property
+    @property
     def points(self) -> NDArray[np.float64]:
         """(V, 2) end points of the returns, metres, scan frame, in the order of the readings."""
-        ranges = self.ranges[self.is_return].astype(np.float64)
-        angles = self.angles[self.is_return]
+        is_return = self.is_return
+        ranges = self.ranges[is_return].astype(np.float64)
+        angles = self.angles[is_return]
         return np.column_stack((ranges * np.cos(angles), ranges * np.sin(angles)))
 
     @property

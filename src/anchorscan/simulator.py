@@ -103,6 +103,7 @@ def occlude(scan: LaserScan, share: float, seed: Seed) -> LaserScan:
     seen = np.where(scan.is_return, ranges, np.where(scan.is_free, scan.range_max, 0.0))
     is_hit = np.zeros(len(scan), dtype=bool)
     geometry = (scan.angle_min, scan.angle_increment, len(scan))
+    angles = scan.angles
     for _ in range(_TRIALS * len(scan)):
         if is_hit.sum() >= (1.0 - _SCATTERED) * wanted:
             break
@@ -111,7 +112,7 @@ def occlude(scan: LaserScan, share: float, seed: Seed) -> LaserScan:
         high = min(seen[reading], _PEOPLE_FARTHEST) - _PERSON_RADIUS
         if high <= low:
             continue
-        distance, angle = rng.uniform(low, high), scan.angles[reading]
+        distance, angle = rng.uniform(low, high), angles[reading]
         person = (distance * math.cos(angle), distance * math.sin(angle), _PERSON_RADIUS)
         met = cast_rays(World(people=np.array([person])), Pose2D(), *geometry)
         seen, is_hit = np.minimum(seen, met), is_hit | (met < seen)
