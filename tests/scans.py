@@ -87,13 +87,6 @@ def turned(scan: LaserScan, angle: float) -> LaserScan:
     )
 
 
-def mirrored(scan: LaserScan) -> LaserScan:
-    """Give what a sensor sees that hangs upside down without saying so."""
-    return LaserScan(
-        scan.ranges, -scan.angle_min, -scan.angle_increment, scan.range_min, scan.range_max
-    )
-
-
 specials = st.sampled_from([math.nan, math.inf, -math.inf, 0.0, -1.0, 1e-30, 79.0, 81.0, 1e30])
 
 

@@ -18,11 +18,11 @@ import numpy as np
 import pytest
 from as_a_user import run
 from fuzz import seeds
-from scans import mirrored
 
 import anchorscan
 from anchorscan import (
     AnchorscanError,
+    Fleet,
     Hypothesis,
     LaserScan,
     LogError,
@@ -328,11 +328,25 @@ class TestWrongMeaning:
         self, records: list[Record]
     ) -> None:
         places = ReferenceSet.build(records)
-        turned = [replace(r, scan=mirrored(r.scan)) for r in records if r.scan is not None]
+        turned = [replace(r, scan=r.scan.upside_down()) for r in records if r.scan is not None]
         assert mirror_check(places, turned).is_mirrored
         assert not mirror_check(places, records).is_mirrored
         other = drive(random_building(9), seed=9, length=20.0)
         assert not mirror_check(places, other).is_mirrored
+
+    def test_a_single_scan_asked_both_ways_is_not_located_at_its_mirror_image(self) -> None:
+        symmetric = random_building(27, length=24.0, depth=14.0)
+        records = drive(symmetric, seed=27, length=40.0)
+        both_ways = Settings.preset().changed({"decision": {"both_ways": True}})
+        trusting, wary = (ReferenceSet.build(records, settings=s) for s in (None, both_ways))
+        scans = [record.scan for record in records if record.scan is not None]
+        turned = [scan.upside_down() for scan in scans]
+        assert sum(trusting.locate(scan)[0].accepted for scan in turned) > 20
+        assert not any(wary.locate(scan)[0].accepted for scan in turned)
+        located = sum(trusting.locate(scan)[0].accepted for scan in scans)
+        assert sum(wary.locate(scan)[0].accepted for scan in scans) > 0.75 * located  # the price
+        fleet = Fleet({"here": wary})
+        assert not any(fleet.locate(scan)[0].hypothesis.accepted for scan in turned)
 
     def test_a_robot_whose_laser_hangs_upside_down_is_located_nowhere_and_says_why(
         self, records: list[Record]
@@ -347,7 +361,7 @@ class TestWrongMeaning:
                 assert record.scan is not None
                 assert record.odometry is not None
                 robot.odometry.add(number, record.odometry)
-                scan = mirrored(record.scan) if is_turned else record.scan
+                scan = record.scan.upside_down() if is_turned else record.scan
                 reports.append(robot.take(scan, number))
             told[is_turned] = [one.state for one in reports if one is not None].count("located")
             assert ("upside down" in robot.doubt) == is_turned

@@ -178,6 +178,18 @@ def test_a_scan_that_one_place_explains_is_an_answer_and_one_that_two_do_is_none
 
 
 @PRESETS
+def test_what_fits_as_well_upside_down_is_no_answer(preset: DecisionSettings) -> None:
+    fits = fits_of([0.95, 0.45])
+    as_asked_one_way = decide(fits, MANY, preset).probabilities[0]
+    assert decide(fits, MANY, preset, upside_down=0.7).probabilities[0] == as_asked_one_way
+    assert not decide(fits, MANY, preset, upside_down=0.95).alike
+    assert not decide(fits, MANY, preset, upside_down=0.99).alike  # and what fits better still
+    places = fits_of([0.95, 0.95, 0.45])
+    assert decide(places, MANY, preset).alike == 2
+    assert not decide(places, MANY, preset, upside_down=0.95).alike
+
+
+@PRESETS
 def test_places_that_explain_a_scan_alike_are_counted(preset: DecisionSettings) -> None:
     def alike(*scores: float) -> int:
         return decide(fits_of(list(scores)), MANY, preset).alike

@@ -53,7 +53,7 @@ def test_killian_court_comes_out_of_its_package() -> None:
     assert longest < 51
     pairs = pairs_after(records, 2.0)
     as_read = overlap(pairs, lambda scan: scan)
-    assert overlap(pairs, mirrored) > 1.5 * as_read
+    assert overlap(pairs, LaserScan.upside_down) > 1.5 * as_read
     assert overlap(pairs, lambda scan: turned(scan, 5)) > 1.3 * as_read
 
 
@@ -95,12 +95,6 @@ def pairs_after(records: list[Record], distance: float) -> list[tuple[Record, Re
     return pairs
 
 
-def mirrored(scan: LaserScan) -> LaserScan:
-    return LaserScan(
-        scan.ranges, -scan.angle_min, -scan.angle_increment, scan.range_min, scan.range_max
-    )
-
-
 def turned(scan: LaserScan, degrees: float) -> LaserScan:
     start = scan.angle_min + math.radians(degrees)
     return LaserScan(scan.ranges, start, scan.angle_increment, scan.range_min, scan.range_max)
@@ -114,7 +108,7 @@ def test_scans_run_counter_clockwise_from_where_they_are_said_to(
         pytest.importorskip("rosbags")
     pairs = pairs_after(real_records(name), 2.0)
     as_read = overlap(pairs, lambda scan: scan)
-    assert overlap(pairs, mirrored) > 1.3 * as_read
+    assert overlap(pairs, LaserScan.upside_down) > 1.3 * as_read
     for degrees in (-5, 5):
         assert overlap(pairs, lambda scan, by=degrees: turned(scan, by)) > 1.1 * as_read
 

@@ -16,7 +16,6 @@ from scans import (
     PLACES,
     WIDE,
     building,
-    mirrored,
     seeds,
     seen_in_building,
     small_room,
@@ -390,7 +389,7 @@ def test_mirror_images_of_scans_are_hardly_proposed():
     for number in range(0, 40, 3):
         anchors, scan, pose = seen(number)
         known = landmarks([(real(anchors), pose)], LIMITS)
-        image = anchor_points(mirrored(scan), DEFAULT.anchors)
+        image = anchor_points(scan.upside_down(), DEFAULT.anchors)
         own += edge_proposals(query_of(real(anchors)), known, numbers_of(LIMITS), out, 0)
         others += edge_proposals(query_of(real(image)), known, numbers_of(LIMITS), out, 0)
     assert others < 0.25 * own

@@ -96,3 +96,11 @@ def test_a_scan_of_which_every_other_reading_is_lost_keeps_the_others_when_thinn
 @given(sweeps(), st.floats(0.0, 1.0))
 def test_a_thinned_scan_has_a_return_where_the_scan_has_one(scan, finest):
     assert scan.thinned(finest).is_return.any() == scan.is_return.any()
+
+
+@given(sweeps())
+def test_upside_down_a_laser_shows_the_mirror_image(scan):
+    turned = scan.upside_down()
+    np.testing.assert_allclose(turned.points, scan.points * (1.0, -1.0), atol=1e-9)
+    assert turned.upside_down().ranges.tobytes() == scan.ranges.tobytes()
+    assert turned.upside_down().angle_min == scan.angle_min

@@ -38,6 +38,11 @@ held to at most
 with the score's margin ``m`` to the highest of any other place, whatever rays see through there:
 doors are opened and walls taken away.
 
+**Upside down.**  A laser that hangs upside down without anybody knowing shows the mirror image of
+every room, and a room on the left of a corridor is the mirror image of one on the right.  With
+``both_ways`` the scan is asked upside down, too, and the best place found then counts as one more
+that may be the same.
+
 Where two or three places explain a scan alike, their scores no farther apart than those of equal
 places, none is an answer, and to say "not known" would keep something back: it is at one of them.
 Such a scan is *ambiguous*: without the other places the best would be an answer.  They are left
@@ -104,6 +109,9 @@ class DecisionSettings(BaseModel):
     )
     twins: float = Field(
         0.012, gt=0.0, description="how far the scores of equal places lie apart, root mean square"
+    )
+    both_ways: bool = Field(
+        False, description="accept only what fits better than upside down; takes twice as long"
     )
     most_alike: int = Field(3, ge=1, description="places that an ambiguous answer names at most")
     widest_deviation: float = Field(
@@ -218,13 +226,16 @@ def _covariances(hessians, residuals, deviations):  # type: ignore[no-untyped-de
     return inverses(information)
 
 
-def decide(fits: Fits, anchors: int, settings: DecisionSettings) -> Decision:
+def decide(
+    fits: Fits, anchors: int, settings: DecisionSettings, upside_down: float = -math.inf
+) -> Decision:
     """Say how likely each fit is, best first, and whether the best is an answer.
 
     Args:
         fits: Of the scan.
         anchors: How many anchor points the scan has.
         settings: Of the decision.
+        upside_down: Highest score of the mirror image of the scan, where that was asked.
     """
     if not len(fits):
         return Decision(np.empty(0), 1.0, 0)
@@ -236,7 +247,7 @@ def decide(fits: Fits, anchors: int, settings: DecisionSettings) -> Decision:
         settings.weights,
         _deviations(settings),
         (settings.elsewhere, settings.rivalry),
-        (settings.threshold, settings.most_alike, settings.twins),
+        (settings.threshold, settings.most_alike, settings.twins, upside_down),
     )
     return Decision(probabilities, elsewhere, alike)
 
@@ -248,21 +259,21 @@ def beside(fits: Fits, settings: DecisionSettings) -> float:
         fits: At least one.
         settings: Of the decision.
     """
-    return float(_beside(fits.features, 1, settings.twins))
+    return float(_beside(fits.features, 1, settings.twins, -math.inf))
 
 
 @kernel
 def _decided(features, hessians, residuals, counts, weights, deviations, others, answer):  # type: ignore[no-untyped-def]
     """Probability of each fit, of none of them, and how many of the first are alike."""
     known = held(_covariances(hessians[:1], residuals[:1], deviations)[0])
-    threshold, most, twins = answer
-    told = (hessians[0, 2, 2], counts, weights, known, twins)
+    threshold, most, twins, upside_down = answer
+    told = (hessians[0, 2, 2], counts, weights, known, twins, upside_down)
     best = _likely(features, 1, told)
     alone, alike = best, 1
     while (
         alone < threshold
         and alike < min(most, len(features))
-        and _beside(features[: alike + 1], alike, twins) < threshold
+        and _beside(features[: alike + 1], alike, twins, -np.inf) < threshold
     ):
         alike += 1
         alone = _likely(features, alike, told)
@@ -277,15 +288,15 @@ def _decided(features, hessians, residuals, counts, weights, deviations, others,
 @kernel
 def _likely(features, second, told):  # type: ignore[no-untyped-def]
     """Probability of the best fit beside those from rank ``second`` on."""
-    heading, counts, weights, known, twins = told
+    heading, counts, weights, known, twins, upside_down = told
     place = _place(_evidence(features, second, heading, counts), weights)
-    return min(known * place, _beside(features, second, twins))
+    return min(known * place, _beside(features, second, twins, upside_down))
 
 
 @kernel
-def _beside(features, second, twins):  # type: ignore[no-untyped-def]
+def _beside(features, second, twins, upside_down):  # type: ignore[no-untyped-def]
     """The most that the best fit can be worth beside those from rank ``second`` on."""
-    margin = np.inf
+    margin = max(features[0, _SCORE] - upside_down, 0.0)
     for k in range(second, len(features)):
         margin = min(margin, max(features[0, _SCORE] - features[k, _SCORE], 0.0))
     return 1.0 - 0.5 * math.exp(-0.5 * (margin / twins) ** 2)

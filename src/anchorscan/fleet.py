@@ -76,11 +76,13 @@ class BuildingFits:
         building: Name of the set.
         anchors: How many anchor points the scan has.
         fits: Of the highest worth first, as many as one set has hypotheses.
+        upside_down: Highest score of the mirror image of the scan, where that is asked.
     """
 
     building: str
     anchors: int
     fits: Fits
+    upside_down: float = -math.inf
 
 
 @dataclass(frozen=True, eq=False)
@@ -224,11 +226,17 @@ def search(
     """
     if not len(description.readings):
         return
+    anchors, upside_down = len(description.anchors), None
     for name, places in sets:
-        fits = places.fits(description)
-        if fits is not None and len(fits):
-            count = places.settings.acceptance.hypotheses
-            yield BuildingFits(name, len(description.anchors), fits[:count])
+        fits, settings = places.fits(description), places.settings
+        if fits is None or not len(fits):
+            continue
+        others = None
+        if settings.decision.both_ways:
+            upside_down = upside_down or describe(description.scan.upside_down(), settings)
+            others = places.fits(upside_down)
+        highest = -math.inf if others is None else others.highest_score
+        yield BuildingFits(name, anchors, fits[: settings.acceptance.hypotheses], highest)
 
 
 def decide_over(
@@ -256,7 +264,7 @@ def decide_over(
     harder = settings.constant - look_alikes * math.log(max(sets, 1))
     anchors = best[0][0].anchors
     stricter = settings.model_copy(update={"constant": harder, "twins": twins})
-    decision = decide(fits, anchors, stricter)
+    decision = decide(fits, anchors, stricter, max(each.upside_down for each in found))
     return [
         BuildingPlace(
             each.building,

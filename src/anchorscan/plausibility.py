@@ -38,7 +38,6 @@ __all__ = [
     "Plausibility",
     "ScaleCheck",
     "mirror_check",
-    "mirror_image",
     "scale_check",
     "scaled_scan",
 ]
@@ -169,7 +168,7 @@ class MirrorCheck:
 
     def with_scan(self, places: _Places, scan: LaserScan) -> MirrorCheck:
         """Return what is found with one more scan, located both ways."""
-        here, there = places.locate(scan)[:1], places.locate(mirror_image(scan))[:1]
+        here, there = places.locate(scan)[:1], places.locate(scan.upside_down())[:1]
         if not (here and there):
             return self
         if there[0].score > here[0].score:
@@ -330,10 +329,3 @@ def scaled_scan(scan: LaserScan, scale: float) -> LaserScan:
     """Return what the same laser would see in a building so many times as large."""
     geometry = (scan.angle_min, scan.angle_increment, scale * scan.range_min)
     return LaserScan(scale * scan.ranges, *geometry, scale * scan.range_max)
-
-
-def mirror_image(scan: LaserScan) -> LaserScan:
-    """Return what a laser sees that hangs upside down without anybody knowing."""
-    return LaserScan(
-        scan.ranges, -scan.angle_min, -scan.angle_increment, scan.range_min, scan.range_max
-    )

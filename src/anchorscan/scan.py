@@ -129,6 +129,12 @@ class LaserScan:
             self.range_max,
         )
 
+    def upside_down(self) -> LaserScan:
+        """Return what the same laser says that hangs upside down: the scan, mirrored at +x."""
+        return LaserScan(
+            self.ranges, -self.angle_min, -self.angle_increment, self.range_min, self.range_max
+        )
+
     @property
     def angles(self) -> NDArray[np.float64]:
         """(N,) direction of every reading, radians, scan frame."""

@@ -288,10 +288,22 @@ class StitchedMap:
         """
         content = self._content
         votes, proposed, fits = self._sought(description, most, content)
-        decision = decide(fits, len(description.anchors), self._settings.decision)
+        decision = self._decided(description, fits, most, content)
         hypotheses, known = self._hypotheses(description, fits, decision, content)
         references = tuple(each.reference for each in known)
         return MapSearch(votes, proposed, fits, decision, references, hypotheses)
+
+    def _decided(
+        self, description: Description, fits: Fits, most: int | None, content: _Content
+    ) -> Decision:
+        """Decide; where that is asked, what may be an answer once more beside its mirror image."""
+        settings, anchors = self._settings.decision, len(description.anchors)
+        decision = decide(fits, anchors, settings)
+        if not (settings.both_ways and decision.alike):
+            return decision
+        upside_down = describe(description.scan.upside_down(), self._settings)
+        _, _, others = self._sought(upside_down, most, content)
+        return decide(fits, anchors, settings, others.highest_score)
 
     def fits(self, description: Description, most: int | None) -> Fits:
         """Search as ``search`` does, but neither decide nor name references."""

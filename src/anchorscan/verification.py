@@ -114,6 +114,11 @@ class Fits:
     def __len__(self) -> int:
         return len(self.poses)
 
+    @property
+    def highest_score(self) -> float:
+        """Of all fits; that of none where there is no fit."""
+        return float(self.features[:, FEATURES.index("score")].max(initial=-math.inf))
+
     def __getitem__(self, chosen: slice) -> Fits:
         """Return some of the fits."""
         return Fits(

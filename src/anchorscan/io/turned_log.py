@@ -6,7 +6,6 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 from ..record import Record
-from ..scan import LaserScan
 from .log import Log, Report
 
 __all__ = ["TurnedLog"]
@@ -29,9 +28,4 @@ class TurnedLog(Log):
     def _read(self, report: Report) -> Iterator[Record]:
         for record in self._log.records(report):
             scan = record.scan
-            yield record if scan is None else replace(record, scan=_turned(scan))
-
-
-def _turned(scan: LaserScan) -> LaserScan:
-    start, increment = -scan.angle_min, -scan.angle_increment
-    return LaserScan(scan.ranges, start, increment, scan.range_min, scan.range_max)
+            yield record if scan is None else replace(record, scan=scan.upside_down())
