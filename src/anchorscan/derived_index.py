@@ -51,7 +51,7 @@ if TYPE_CHECKING:
 __all__ = ["DerivedIndex", "IndexedReferences", "index_path", "read_index", "write_index"]
 
 # What is stored, and how; raise it when that changes.
-_FORMAT = 1
+_FORMAT = 2
 # Whoever changes one of these derives something else from the same references; the first names
 # the version.
 _STAGES = (
