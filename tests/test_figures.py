@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import re
 import sys
 from collections.abc import Iterator
 from dataclasses import fields
@@ -291,6 +292,19 @@ def test_explain_writes_the_pictures_and_names_them(
     assert "scan 2: " in done.err.splitlines()[-1]
     # The scan is a reference of the set: it was located, and laid on itself.
     assert "probability" in done.err.splitlines()[-1]
+
+
+def test_explain_tells_how_well_a_scan_fits_upside_down_where_that_is_asked(
+    files: tuple[Path, Path], tmp_path: Path
+) -> None:
+    both_ways = tmp_path / "both-ways.json"
+    both_ways.write_text('{"decision": {"both_ways": true}}', encoding="utf-8")
+    words = ("explain", *files, "--scan", 2, "-o", tmp_path / "why")
+    assert "upside down" not in run(*words).err
+    said = run(*words, "--settings", both_ways).err.splitlines()[-1]
+    found = re.search(r"its score is ([\d.]+), that of the best guess upside down ([\d.]+)$", said)
+    assert found is not None
+    assert float(found[1]) > float(found[2])
 
 
 def test_explain_says_what_is_wrong_with_the_number_of_the_scan(

@@ -141,11 +141,14 @@ class Decision:
         alike: How many of the first fits explain the scan alike, so that it was taken at one of
             them: 1 where the first is an answer, 2 or more where it is ambiguous, 0 where
             nothing is known.
+        upside_down: Highest score of the mirror image of the scan; minus infinity where that was
+            not asked.
     """
 
     probabilities: NDArray[np.float64]
     elsewhere: float
     alike: int
+    upside_down: float = -math.inf
 
     @property
     def accepted(self) -> bool:
@@ -249,7 +252,7 @@ def decide(
         (settings.elsewhere, settings.rivalry),
         (settings.threshold, settings.most_alike, settings.twins, upside_down),
     )
-    return Decision(probabilities, elsewhere, alike)
+    return Decision(probabilities, elsewhere, alike, upside_down)
 
 
 def beside(fits: Fits, settings: DecisionSettings) -> float:

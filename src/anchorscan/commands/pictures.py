@@ -89,7 +89,11 @@ def explain(
     themes = [each for name, each in THEMES.items() if theme.value in (name, "both")]
     for path in save_all(explanation, output, themes, file_format.value):
         typer.echo(str(path))
-    say(f"{log}: scan {scan}: {_verdict(trace.hypotheses)}")
+    said = [_verdict(trace.hypotheses)]
+    if trace.decision is not None and math.isfinite(trace.decision.upside_down):
+        best, other = trace.hypotheses[0].score, trace.decision.upside_down
+        said.append(f"its score is {best:.3f}, that of the best guess upside down {other:.3f}")
+    say(f"{log}: scan {scan}: {'; '.join(said)}")
 
 
 _VERDICTS = {
