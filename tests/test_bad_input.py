@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 from as_a_user import run
 from fuzz import seeds
+from scans import drawn
 
 import anchorscan
 from anchorscan import (
@@ -43,7 +44,7 @@ from anchorscan.answers import read_runs
 from anchorscan.localizer import Belief, Localizer
 from anchorscan.plausibility import MirrorWatch, Plausibility, mirror_check
 from anchorscan.robot import Robot
-from anchorscan.set_check import check
+from anchorscan.set_check import check, detours_of
 from anchorscan.wrong_data import displaced
 
 LINE = f"FLASER 180 {' '.join(['1.5'] * 180)} 1 2 3 1 2 3 0 host 0\n".encode()
@@ -441,7 +442,7 @@ class TestCheck:
         places = ReferenceSet(path=tmp_path / "a.apr")
         places.add_batch([r.scan for r in moved], [r.pose for r in moved])
         found = {each.reference.identifier: each for each in check(places)}
-        bad = {n for n, each in found.items() if each.verdict in ("misplaced", "contradicted")}
+        bad = {n for n, each in found.items() if each.is_wrong}
         assert len(bad & wrong) >= 0.7 * len(wrong)
         assert len(bad - wrong) <= 0.05 * len(kept)
         for number in bad & wrong:
@@ -459,6 +460,35 @@ class TestCheck:
         assert "misplaced" not in done.out
         assert done.code == int(" 0 do not" not in done.out)
         assert " 0 do not" in done.out or " 1 do not" in done.out
+
+    def test_a_reference_off_the_way_where_nobody_has_been_is_astray(self, tmp_path: Path) -> None:
+        corridor = [(-2.0, -1.0, 62.0, -1.0), (-2.0, 1.0, 62.0, 1.0)]
+        poses = [Pose2D(2.0 * k, 0.0, 0.0) for k in range(31)]
+        scans = [drawn(corridor, at=pose) for pose in poses]
+        poses[12] = Pose2D(24.0, 9.0, 0.0)
+        with ReferenceSet(path=tmp_path / "a.apr") as places:
+            places.add_batch(scans, poses)
+            assert [each.verdict for each in check(places)].count("astray") == 1
+        done = run("check", str(tmp_path / "a.apr"))
+        assert done.code == 1
+        first, last = done.out.splitlines()
+        assert first.startswith("reference 12 at x 24.00 m, y 9.00 m, 0 degrees: ")
+        assert "astray, a detour of 14.4 m; 0 % of its readings" in first
+        assert "1 do not" in last
+
+    def test_what_lies_on_a_way_makes_no_detour(self) -> None:
+        way = np.array([[0.0, 0.0], [2.0, 0.0], [4.0, 3.0], [6.0, 0.0], [8.0, 0.0], [8.0, 2.0]])
+        off = 2.0 * math.hypot(2.0, 3.0) - 4.0
+        corner = 2.0 + 2.0 - math.hypot(2.0, 2.0)
+        expected = [0.0, 0.0, off, 0.0, corner, 0.0]
+        np.testing.assert_allclose(detours_of(way[:2]), [0.0, 0.0])
+        # Of six references two make a detour: too many for a way, unless it is longer.
+        assert not detours_of(way).any()
+        longer = np.concatenate([np.arange(-20.0, 0.0)[:, None] * (1.0, 0.0), way])
+        np.testing.assert_allclose(detours_of(longer)[-6:], expected)
+
+    def test_references_in_no_order_make_no_detour(self) -> None:
+        assert not detours_of(np.random.default_rng(4).uniform(-20.0, 20.0, (90, 2))).any()
 
     def test_a_set_without_poses_cannot_be_checked(self, tmp_path: Path) -> None:
         with ReferenceSet(path=tmp_path / "a.apr") as places:

@@ -3,7 +3,9 @@
 Every reference is taken out of the map, compared with what the others show at its own pose, and
 located among them.  One that fits clearly better somewhere else was put into the set with a wrong
 pose; so, in all likelihood, was one whose readings end where the others saw no surface.  A place
-that no other reference has seen cannot be judged.
+that no other reference has seen cannot be judged by them.  But references are taken on a way, one
+after the other: one that lies far off the way from the one before it to the one after it, and that
+the others do not bear out, was put there by mistake.
 
 Wrong poses in a twentieth of the references do not make answers wrong, since the others outvote
 them (figures in the documentation); they make them less sure.
@@ -17,6 +19,7 @@ from dataclasses import dataclass
 from typing import Literal, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .errors import ReferenceSetError
 from .matcher import Matcher
@@ -29,7 +32,7 @@ from .verification import FEATURES
 __all__ = ["ReferenceCheck", "Verdict", "check", "run"]
 
 Item = TypeVar("Item")
-Verdict = Literal["sound", "misplaced", "contradicted", "alone"]
+Verdict = Literal["sound", "misplaced", "contradicted", "astray", "alone"]
 
 _NEAR, _UNKNOWN = FEATURES.index("near"), FEATURES.index("unknown")
 # A pose that is off by less is no wrong one: what counts as correct, doubled in heading.
@@ -39,6 +42,11 @@ _CLEARLY_BETTER = 0.2
 _UNSEEN = 0.5
 # Of the readings in places that others saw, if these are enough.
 _TOO_FEW_NEAR, _FEWEST_SEEN = 0.5, 0.15
+# By how much one reference makes the way longer, metres, and the share of its readings that bear
+# it out.
+_DETOUR, _BORNE_OUT = 3.0, 0.8
+# References of which more than a quarter make the way longer by so much do not lie on one, metres.
+_ON_NO_WAY = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,8 +56,13 @@ class ReferenceCheck:
     Args:
         reference: The reference.
         verdict: "sound"; "misplaced", it fits elsewhere; "contradicted", it does not fit where
-            it is said to be, nor surely elsewhere; "alone", no other has seen its place.
+            it is said to be, nor surely elsewhere; "astray", it lies off the way of those before
+            and after it, and few of its readings agree with any other; "alone", no other has
+            seen its place.
         near: Share of its readings that end within 10 cm of a surface that others saw.
+        seen: Share of its readings that end in places that others saw.
+        detour: By how much longer the way from the reference before it to the one after it gets
+            by it, metres.
         elsewhere: ``T_set_laser`` where it fits, if it is misplaced.
         near_elsewhere: Share of the readings near a surface there; NaN if it is not misplaced.
     """
@@ -58,8 +71,14 @@ class ReferenceCheck:
     verdict: Verdict
     near: float
     seen: float
+    detour: float
     elsewhere: Pose2D | None = None
     near_elsewhere: float = math.nan
+
+    @property
+    def is_wrong(self) -> bool:
+        """Whether its pose is, in all likelihood."""
+        return self.verdict in ("misplaced", "contradicted", "astray")
 
     def __str__(self) -> str:
         """Say it in one line."""
@@ -68,6 +87,8 @@ class ReferenceCheck:
         pose = reference.pose
         assert pose is not None
         begin = f"reference {reference.identifier}{name} at {_place(pose)}: {self.verdict}"
+        if self.verdict == "astray":
+            begin += f", a detour of {self.detour:.1f} m"
         if self.elsewhere is None:
             return (
                 f"{begin}; {100.0 * self.near:.0f} % of its readings agree with the others, "
@@ -102,20 +123,42 @@ def check(
             f"{places.path or 'the set'}: only references with poses, searched as one map, can be "
             f"compared with each other; here are {len(posed)} with a pose"
         )
-    for reference in progress(posed, "checking", len(posed)):
+    detours = detours_of(np.array([[each.pose.x, each.pose.y] for each in posed if each.pose]))
+    judged = zip(posed, detours.tolist(), strict=True)
+    for reference, detour in progress(judged, "checking", len(posed)):
         matcher.remove(reference.identifier)
-        yield _judge(reference, matcher)
+        yield _judge(reference, detour, matcher)
         matcher.add(reference)
 
 
-def run(places: ReferenceSet, say: Callable[[str], None], progress: ProgressOf) -> int:
-    """Name the references that contradict the others, the worst first.
+def detours_of(positions: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Say by how much each of some positions makes the way through all of them longer.
+
+    Args:
+        positions: (N, 2) in the order of the way, metres.
 
     Returns:
-        How many are misplaced or contradicted.
+        (N,) metres; 0 for the ends, for one beside another that makes it longer still, and for
+        all where the order is no way: one that leads to and fro everywhere.
+    """
+    lengths = np.hypot(*np.diff(positions, axis=0).T)
+    straight = np.hypot(*(positions[2:] - positions[:-2]).T)
+    detours = np.zeros(len(positions) + 2)  # with one beyond either end
+    detours[2:-2] = lengths[:-1] + lengths[1:] - straight
+    if len(positions) < 3 or np.quantile(detours[2:-2], 0.75) > _ON_NO_WAY:
+        return np.zeros(len(positions))
+    is_largest = (detours[1:-1] >= detours[:-2]) & (detours[1:-1] >= detours[2:])
+    return np.where(is_largest, detours[1:-1], 0.0)
+
+
+def run(places: ReferenceSet, say: Callable[[str], None], progress: ProgressOf) -> int:
+    """Name the references whose poses are wrong, the worst first.
+
+    Returns:
+        How many.
     """
     found = list(check(places, progress))
-    bad = [each for each in found if each.verdict in ("misplaced", "contradicted")]
+    bad = [each for each in found if each.is_wrong]
     for each in sorted(bad, key=lambda each: (each.verdict != "misplaced", each.near)):
         say(str(each))
     alone = sum(each.verdict == "alone" for each in found)
@@ -126,11 +169,11 @@ def run(places: ReferenceSet, say: Callable[[str], None], progress: ProgressOf) 
     return len(bad)
 
 
-def _judge(reference: Reference, others: Matcher) -> ReferenceCheck:
+def _judge(reference: Reference, detour: float, others: Matcher) -> ReferenceCheck:
     pose = reference.pose
     assert pose is not None
     if not reference.scan.is_return.any():
-        return ReferenceCheck(reference, "alone", math.nan, 0.0)
+        return ReferenceCheck(reference, "alone", math.nan, 0.0, detour)
     here = others.follow(reference.scan, pose.to_array()[None], np.zeros((1, 3, 3)))
     near, unknown = here.features[0, [_NEAR, _UNKNOWN]].tolist()
     seen = 1.0 - unknown
@@ -140,10 +183,18 @@ def _judge(reference: Reference, others: Matcher) -> ReferenceCheck:
         near_there = float(trace.in_map.fits.features[0, _NEAR])
         is_away = best.pose.distance(pose) > _AWAY or best.pose.turn(pose) > _TURNED
         if is_away and near_there - near > _CLEARLY_BETTER:
-            return ReferenceCheck(reference, "misplaced", near, seen, best.pose, near_there)
+            found = (near, seen, detour, best.pose, near_there)
+            return ReferenceCheck(reference, "misplaced", *found)
+    return ReferenceCheck(reference, _verdict_here(near, seen, detour), near, seen, detour)
+
+
+def _verdict_here(near: float, seen: float, detour: float) -> Verdict:
+    """Judge a reference that fits nowhere else."""
     if seen >= _FEWEST_SEEN and near < _TOO_FEW_NEAR * seen:
-        return ReferenceCheck(reference, "contradicted", near, seen)
-    return ReferenceCheck(reference, "alone" if unknown >= _UNSEEN else "sound", near, seen)
+        return "contradicted"
+    if detour > _DETOUR and near < _BORNE_OUT:
+        return "astray"
+    return "alone" if 1.0 - seen >= _UNSEEN else "sound"
 
 
 def _place(pose: Pose2D) -> str:

@@ -144,11 +144,7 @@ def _row(task: SplitCase, settings: Settings, queries: int, seed: int) -> list[o
     places = _set(known, settings)
     moved, wrong = displaced(known, np.random.default_rng(seed))
     misplaced = _set(moved, settings)
-    named = {
-        each.reference.identifier
-        for each in check(misplaced)
-        if each.verdict in ("misplaced", "contradicted")
-    }
+    named = {each.reference.identifier for each in check(misplaced) if each.is_wrong}
     turned = [mirrored(record) for record in asked]
     wary = _set(known, settings.changed({"decision": {"both_ways": True}}))
     drive = list(map(mirrored, task.asked.records))
