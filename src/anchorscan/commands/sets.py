@@ -53,7 +53,9 @@ def check(
     *,
     settings: SettingsOptions,
 ) -> None:
-    """Name the references that contradict the others: wrong poses, or places that have changed.
+    """Name the references that contradict the others, or lie off their way.
+
+    Their poses are wrong, or their places have changed.
 
     The exit code is 1 when there are any.
     """
