@@ -484,7 +484,7 @@ class TestCheck:
         np.testing.assert_allclose(detours_of(way[:2]), [0.0, 0.0])
         # Of six references two make a detour: too many for a way, unless it is longer.
         assert not detours_of(way).any()
-        longer = np.concatenate([np.arange(-20.0, 0.0)[:, None] * (1.0, 0.0), way])
+        longer = np.concatenate([np.arange(-40.0, 0.0, 2.0)[:, None] * (1.0, 0.0), way])
         np.testing.assert_allclose(detours_of(longer)[-6:], expected)
 
     def test_references_in_no_order_make_no_detour(self) -> None:

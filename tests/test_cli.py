@@ -231,6 +231,48 @@ def test_several_logs_make_one_set(run: Run, records: list[Record], tmp_path: Pa
     assert len(ReferenceSet.open(tmp_path / "both.apr")) == len(records)
 
 
+def test_a_later_log_is_added_and_references_are_removed(run: Run, tmp_path: Path) -> None:
+    building = random_building(5, length=24.0, depth=14.0)
+    first = write_log(tmp_path / "1.log", drive(building, seed=3, length=20.0))
+    later = drive(building, seed=2, length=20.0)
+    second, places = write_log(tmp_path / "2.log", later), tmp_path / "a.apr"
+    assert run("build", first, "-o", places, "--spacing", 1).code == 0
+    before = len(ReferenceSet.open(places))
+    done = run("add", places, second)
+    assert done.code == 0
+    after = len(ReferenceSet.open(places))
+    assert f"{after - before} references added from {len(later)} scans" in done.err
+    assert after > before
+    assert "0 references added" in run("add", places, second).err
+
+    missing = run("remove", places, 2, 9999, 3)
+    assert missing.code == 1
+    assert "has no reference 9999" in missing.err
+    assert len(ReferenceSet.open(places)) == after
+    assert run("remove", places, 2, 3, 2).code == 0
+    left = ReferenceSet.open(places)
+    assert len(left) == after - 2
+    assert 2 not in left
+
+
+@pytest.mark.parametrize("moved", [Pose2D(0.0, 0.0, math.pi / 2.0), Pose2D(3.0, -2.0, 0.0)])
+def test_a_log_of_another_frame_is_not_added(run: Run, tmp_path: Path, moved: Pose2D) -> None:
+    building = random_building(5, length=24.0, depth=14.0)
+    places = tmp_path / "a.apr"
+    ReferenceSet.build(drive(building, seed=3, length=60.0), path=places).close()
+    before = places.read_bytes()
+    later = [
+        replace(record, pose=moved @ record.pose)
+        for record in drive(building, seed=2, length=10.0)
+        if record.pose is not None
+    ]
+    refused = run("add", places, write_log(tmp_path / "turned.log", later))
+    assert refused.code == 1
+    assert "its poses are in another frame" in refused.err
+    assert "Traceback" not in refused.err
+    assert places.read_bytes() == before
+
+
 def test_info_says_what_a_set_holds(run: Run, places: Path, records: list[Record]) -> None:
     facts = json.loads(run("info", places, "--json").out)
     assert facts["references"] == facts["with_pose"] == len(records)

@@ -445,6 +445,40 @@ class TestResume:
         assert (path.read_bytes(), by_hand.read_bytes()) == before
 
 
+class TestExtend:
+    @pytest.mark.parametrize("split", [1, 5, 9])
+    def test_a_set_extended_by_the_rest_of_a_log_is_that_of_the_whole(
+        self, drive: list[Record], split: int, tmp_path: Path
+    ) -> None:
+        whole = ReferenceSet.build(drive, spacing=1.0)
+        with ReferenceSet.build(drive[:split], spacing=1.0, path=tmp_path / "a.apr") as places:
+            state = places.extend(iter(drive[split:]))  # by the rule of the build
+            assert state.consumed == len(drive) - split
+            assert list(map(meaning, places)) == list(map(meaning, whole))
+            before = len(places)
+            places.extend(drive)
+            assert len(places) == before
+        assert len(ReferenceSet.open(tmp_path / "a.apr")) == before
+
+    def test_another_rule_and_what_is_of_no_use_count(self) -> None:
+        places = ReferenceSet()
+        places.add(SCAN, Pose2D())
+        blind = LaserScan([math.inf], 0.0, 0.1)
+        records = [
+            Record(0, SCAN, Pose2D(0.4, 0.0, 0.0)),
+            Record(1, SCAN, Pose2D(0.6, 0.0, 0.0)),
+            Record(2, SCAN, None),
+            Record(3, blind, Pose2D()),
+        ]
+        state = places.extend(records, spacing=0.5, heading=1.0)
+        assert (state.consumed, state.unusable, state.without_pose) == (4, 1, 1)
+        assert [each.pose.x for each in places if each.pose] == [0.0, 0.6]
+        places.extend(records, keep_all=True)
+        assert len(places) == 4
+        with pytest.raises(SettingsError, match="negative"):
+            places.extend(records, spacing=-1.0)
+
+
 class TestRefresh:
     def test_it_takes_over_what_others_wrote(self, tmp_path: Path) -> None:
         path = tmp_path / "a.apr"

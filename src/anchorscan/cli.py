@@ -32,6 +32,7 @@ app = typer.Typer(
 # In the order in which help and documentation list them.
 _COMMANDS: tuple[Callable[..., None], ...] = (
     build.build,
+    build.add,
     answers.locate,
     answers.which,
     servers.serve,
@@ -42,6 +43,7 @@ _COMMANDS: tuple[Callable[..., None], ...] = (
     sets.info,
     sets.index,
     sets.check,
+    sets.remove,
     measures.bench,
     measures.scale,
     measures.bench_fleet,

@@ -71,6 +71,8 @@ if TYPE_CHECKING:
 __all__ = ["ReferenceSet", "SetInfo"]
 
 _BATCH = 256
+# Between references, metres and radians, where nobody says it.
+_SPACING, _HEADING = 2.0, math.radians(45.0)
 # An index that is behind by more than this share of its references is no help.
 _BEHIND_SHARE = 0.25
 _CHUNKS = 8
@@ -160,8 +162,8 @@ class ReferenceSet:
         cls,
         records: Iterable[Record],
         *,
-        spacing: float = 2.0,
-        heading: float = math.radians(45.0),
+        spacing: float = _SPACING,
+        heading: float = _HEADING,
         keep_all: bool = False,
         settings: Settings | None = None,
         name: str = "",
@@ -193,11 +195,7 @@ class ReferenceSet:
                 set made of other records or by another rule; or it cannot be written.
             SettingsError: ``spacing`` or ``heading`` is negative or not a number.
         """
-        if not (spacing >= 0.0 and heading >= 0.0):
-            raise SettingsError(
-                f"spacing and heading must not be negative, not {spacing} and {heading}"
-            )
-        start = BuildState(float(spacing) + 0.0, float(heading) + 0.0, bool(keep_all))
+        start = _begun(spacing, heading, keep_all)
         if path is not None and os.path.lexists(path):
             places = cls._to_continue(Path(path), start, settings, name)
         else:
@@ -440,6 +438,42 @@ class ReferenceSet:
                 f"{len(scans)} scans, {len(poses)} poses and {len(names)} names do not go together"
             )
         return self._store([Place(*place) for place in zip(scans, poses, names, strict=True)])
+
+    def extend(
+        self,
+        records: Iterable[Record],
+        *,
+        spacing: float | None = None,
+        heading: float | None = None,
+        keep_all: bool = False,
+    ) -> BuildState:
+        """Add references from another log whose poses are in the frame of the set.
+
+        Chosen as ``build`` does: where no reference lies within ``spacing`` and ``heading``.
+        They are stored as they come; one that is interrupted can be repeated.
+
+        Args:
+            records: In any order.
+            spacing: Metres, not negative; None is that of the set's build, or 2.
+            heading: Radians, not negative; None likewise, or 45 degrees.
+            keep_all: Keep every usable scan with a pose, whatever the rule says.
+
+        Returns:
+            The rule, and what was read.
+
+        Raises:
+            ReferenceSetError: The file cannot be written.
+            SettingsError: ``spacing`` or ``heading`` is negative or not a number.
+        """
+        rule = self._build or BuildState(_SPACING, _HEADING, False)
+        spacing = rule.spacing if spacing is None else spacing
+        heading = rule.heading if heading is None else heading
+        state = _begun(spacing, heading, keep_all)
+        neighbourhood = self._neighbourhood(state)
+        for batch in _batches(records):
+            kept, state = _choose(batch, state, neighbourhood)
+            self._store(kept)
+        return replace(state, finished=True)
 
     def remove(self, identifier: int) -> None:
         """Remove a reference; its identifier is never used again.
@@ -727,11 +761,8 @@ class ReferenceSet:
             self._build = start
         state = self._build
         self._check_trail(records, state)
-        neighbourhood = _Neighbourhood(state.spacing, state.heading)
-        for reference in self.references:
-            if reference.pose is not None:
-                neighbourhood.add(reference.pose)
-        for batch in iter(lambda: list(islice(records, _BATCH)), []):
+        neighbourhood = self._neighbourhood(state)
+        for batch in _batches(records):
             kept, state = _choose(batch, state, neighbourhood)
             self._advance(kept, state)
             if progress is not None:
@@ -740,6 +771,14 @@ class ReferenceSet:
             raise ReferenceSetError(_nothing_kept(state))
         if not state.finished:
             self._advance([], replace(state, finished=True))
+
+    def _neighbourhood(self, state: BuildState) -> _Neighbourhood:
+        """Where there are references, by a rule."""
+        neighbourhood = _Neighbourhood(state.spacing, state.heading)
+        for reference in self.references:
+            if reference.pose is not None:
+                neighbourhood.add(reference.pose)
+        return neighbourhood
 
     def _check_trail(self, records: Iterator[Record], state: BuildState) -> None:
         trail, count = bytes(16), 0
@@ -832,6 +871,25 @@ class _Neighbourhood:
     def _index(self, coordinate: float) -> int:
         # What is too far out for exact cells shares the last one: slower, but right.
         return math.floor(min(max(coordinate / self._side, -_FARTHEST_CELL), _FARTHEST_CELL))
+
+
+def _begun(spacing: float, heading: float, keep_all: bool) -> BuildState:
+    """Begin to choose by a rule.
+
+    Raises:
+        SettingsError: It is none.
+    """
+    if not (spacing >= 0.0 and heading >= 0.0):
+        raise SettingsError(
+            f"spacing and heading must not be negative, not {spacing} and {heading}"
+        )
+    return BuildState(float(spacing) + 0.0, float(heading) + 0.0, bool(keep_all))
+
+
+def _batches(records: Iterable[Record]) -> Iterator[list[Record]]:
+    """Take some records at a time, each stored as one."""
+    left = iter(records)
+    return iter(lambda: list(islice(left, _BATCH)), [])
 
 
 def _choose(

@@ -1,4 +1,4 @@
-"""``anchorscan check``: which references of a set contradict the others.
+"""Which references of a set contradict the others (``anchorscan check``), or would (``add``).
 
 Every reference is taken out of the map, compared with what the others show at its own pose, and
 located among them.  One that fits clearly better somewhere else was put into the set with a wrong
@@ -14,8 +14,10 @@ them (figures in the documentation); they make them less sure.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from itertools import islice
 from typing import Literal, TypeVar
 
 import numpy as np
@@ -25,11 +27,12 @@ from .errors import ReferenceSetError
 from .matcher import Matcher
 from .pose import Pose2D
 from .progress import ProgressOf
+from .record import Record
 from .reference import Reference
 from .reference_set import ReferenceSet
 from .verification import FEATURES
 
-__all__ = ["ReferenceCheck", "Verdict", "check", "run"]
+__all__ = ["FrameCheck", "ReferenceCheck", "Verdict", "check", "frame_check", "run"]
 
 Item = TypeVar("Item")
 Verdict = Literal["sound", "misplaced", "contradicted", "astray", "alone"]
@@ -45,8 +48,13 @@ _TOO_FEW_NEAR, _FEWEST_SEEN = 0.5, 0.15
 # By how much one reference makes the way longer, metres, and the share of its readings that bear
 # it out.
 _DETOUR, _BORNE_OUT = 3.0, 0.8
-# References of which more than a quarter make the way longer by so much do not lie on one, metres.
-_ON_NO_WAY = 1.0
+# References of which more than a quarter make the way longer by so much do not lie on one, metres;
+# nor do two that are more of its usual steps apart, between which one is left out.
+_ON_NO_WAY, _MOST_STEPS = 1.0, 3.0
+# Scans of a log that are judged, of so many at its beginning; how many of these, and which share,
+# have to be wrong for the frame to be.
+_LOOKED_AT, _ASKED = 400, 24
+_FEWEST, _WRONG_SHARE = 5, 0.7
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,8 +146,9 @@ def detours_of(positions: NDArray[np.float64]) -> NDArray[np.float64]:
         positions: (N, 2) in the order of the way, metres.
 
     Returns:
-        (N,) metres; 0 for the ends, for one beside another that makes it longer still, and for
-        all where the order is no way: one that leads to and fro everywhere.
+        (N,) metres; 0 for the ends, for one beside another that makes it longer still, for one
+        whose neighbours are far apart, as where one log follows another, and for all where the
+        order is no way: one that leads to and fro everywhere.
     """
     lengths = np.hypot(*np.diff(positions, axis=0).T)
     straight = np.hypot(*(positions[2:] - positions[:-2]).T)
@@ -147,8 +156,57 @@ def detours_of(positions: NDArray[np.float64]) -> NDArray[np.float64]:
     detours[2:-2] = lengths[:-1] + lengths[1:] - straight
     if len(positions) < 3 or np.quantile(detours[2:-2], 0.75) > _ON_NO_WAY:
         return np.zeros(len(positions))
+    detours[2:-2][straight > _MOST_STEPS * np.median(lengths)] = 0.0
     is_largest = (detours[1:-1] >= detours[:-2]) & (detours[1:-1] >= detours[2:])
     return np.where(is_largest, detours[1:-1], 0.0)
+
+
+@dataclass(frozen=True)
+class FrameCheck:
+    """What a set says of the poses of a log that is to be added to it.
+
+    Args:
+        agree: Scans that the set bears out at their poses.
+        contradict: Scans that fit elsewhere, or do not fit where their poses say.
+    """
+
+    agree: int
+    contradict: int
+
+    def __str__(self) -> str:
+        """As the middle of a message."""
+        return (
+            f"its scans do not fit the set where its poses say ({self.contradict} of "
+            f"{self.agree + self.contradict} in places that the set knows)"
+        )
+
+    @property
+    def is_another(self) -> bool:
+        """Whether the poses are in another frame than the set, beyond reasonable doubt."""
+        judged = self.agree + self.contradict
+        return self.contradict >= _FEWEST and self.contradict >= _WRONG_SHARE * judged
+
+
+def frame_check(places: ReferenceSet, records: Iterable[Record]) -> FrameCheck:
+    """Judge some scans of the beginning of a log as references of a set are judged.
+
+    Those in places that the set does not know say nothing, and so does a set that is not searched
+    as one map.
+
+    Args:
+        places: The set.
+        records: The log, from its beginning.
+    """
+    if not places.has_poses or places.settings.method != "map":
+        return FrameCheck(0, 0)
+    some = [
+        Reference(record.index, record.scan, record.pose)
+        for record in islice(records, _LOOKED_AT)
+        if record.scan is not None and record.pose is not None and record.pose.is_finite()
+    ]
+    asked = some[:: max(1, len(some) // _ASKED)]
+    found = Counter(_judge(each, 0.0, places).verdict for each in asked)
+    return FrameCheck(found["sound"], found["misplaced"] + found["contradicted"])
 
 
 def run(places: ReferenceSet, say: Callable[[str], None], progress: ProgressOf) -> int:
@@ -169,7 +227,7 @@ def run(places: ReferenceSet, say: Callable[[str], None], progress: ProgressOf) 
     return len(bad)
 
 
-def _judge(reference: Reference, detour: float, others: Matcher) -> ReferenceCheck:
+def _judge(reference: Reference, detour: float, others: Matcher | ReferenceSet) -> ReferenceCheck:
     pose = reference.pose
     assert pose is not None
     if not reference.scan.is_return.any():

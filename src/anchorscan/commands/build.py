@@ -1,4 +1,4 @@
-"""``build``: a reference set of logs with poses, or of a map."""
+"""``build`` and ``add``: a reference set of logs with poses, or of a map."""
 
 from __future__ import annotations
 
@@ -14,24 +14,15 @@ import typer
 
 from ..errors import AnchorscanError
 from .console import progress, say
-from .logs import problems, records_of, stem
-from .options import (
-    FieldOfViewOption,
-    LaserOption,
-    LogOptions,
-    RangeMaxOption,
-    SettingsOptions,
-    SharingOptions,
-    TopicOption,
-    UpsideDownOption,
-)
+from .logs import problems, records_of, refuse_another_frame, refuse_mirrored, stem
+from .options import LaserOption, LogOptions, SetArgument, SettingsOptions, SharingOptions
 
 if TYPE_CHECKING:
     from ..cluster import Spread
     from ..record import Record
-    from ..reference_set import SetInfo
+    from ..set_file import BuildState
 
-__all__ = ["build"]
+__all__ = ["add", "build"]
 
 _MAP_SUFFIXES = (".yaml", ".yml")
 # Sets of fewer references open in a moment without an index.
@@ -45,6 +36,45 @@ class Body(str, Enum):
     laser = "laser"
 
 
+@dataclass(frozen=True)
+class RuleOptions:
+    """Which scans become references."""
+
+    spacing: Annotated[
+        float | None,
+        typer.Option(min=0.0, metavar="M", help="Metres between references (2; in a map 1.5) ..."),
+    ] = None
+    heading: Annotated[
+        float | None,
+        typer.Option(min=0.0, max=180.0, metavar="DEG", help="... or degrees (45; in a map 90)."),
+    ] = None
+    keep_all: Annotated[bool, typer.Option("--all", help="Keep every scan with a pose.")] = False
+
+    @property
+    def radians(self) -> float | None:
+        """The heading."""
+        return None if self.heading is None else math.radians(self.heading)
+
+
+@dataclass(frozen=True)
+class PosesOptions:
+    """Where the poses of a log are, where it does not hold them itself."""
+
+    poses: Annotated[
+        str | None,
+        typer.Option(metavar="FILE|TOPIC", help="Poses from a TUM file, a topic, or /tf."),
+    ] = None
+    poses_of: Annotated[
+        Body, typer.Option(help="Whose poses those are, if a topic does not say.")
+    ] = Body.base
+    laser: LaserOption = None
+
+    def posing(self) -> dict[str, Any]:
+        """Return it as ``open_log`` wants it."""
+        poses = _from_anywhere(self.poses)
+        return {"poses": poses, "poses_of": self.poses_of.value, "T_base_laser": self.laser}
+
+
 def build(
     logs: Annotated[
         list[Path],
@@ -53,28 +83,10 @@ def build(
     output: Annotated[
         Path, typer.Option("--output", "-o", metavar="SET", help="The reference set to write.")
     ],
-    spacing: Annotated[
-        float | None,
-        typer.Option(min=0.0, metavar="M", help="Metres between references (2; in a map 1.5) ..."),
-    ] = None,
-    heading: Annotated[
-        float | None,
-        typer.Option(min=0.0, max=180.0, metavar="DEG", help="... or degrees (45; in a map 90)."),
-    ] = None,
-    keep_all: Annotated[bool, typer.Option("--all", help="Keep every scan with a pose.")] = False,
-    field_of_view: FieldOfViewOption = None,
-    range_max: RangeMaxOption = None,
-    topic: TopicOption = None,
-    poses: Annotated[
-        str | None,
-        typer.Option(metavar="FILE|TOPIC", help="Poses from a TUM file, a topic, or /tf."),
-    ] = None,
-    poses_of: Annotated[
-        Body, typer.Option(help="Whose poses those are, if a topic does not say.")
-    ] = Body.base,
-    laser: LaserOption = None,
-    upside_down: UpsideDownOption = False,
     *,
+    rule: RuleOptions,
+    reading: LogOptions,
+    posing: PosesOptions,
     settings: SettingsOptions,
     index: Annotated[
         bool | None,
@@ -99,14 +111,15 @@ def build(
     """
     chosen = settings.read()
     is_map = any(map(_is_map, logs))
-    if is_map and (topic or poses or laser or upside_down or (len(logs) > 1 and not each)):
+    said = reading.topic or reading.upside_down or posing.poses or posing.laser
+    if is_map and (said or (len(logs) > 1 and not each)):
         raise typer.BadParameter("a map is built from alone: no other logs, no topics or poses")
     recipe = _Recipe(
-        LogOptions(field_of_view, range_max, topic, upside_down).reading(),
-        {"poses": _from_anywhere(poses), "poses_of": poses_of.value, "T_base_laser": laser},
-        spacing,
-        None if heading is None else math.radians(heading),
-        keep_all,
+        reading.reading(),
+        posing.posing(),
+        rule.spacing,
+        rule.radians,
+        rule.keep_all,
         None if chosen is None else chosen.to_json(),
     )
 
@@ -124,6 +137,43 @@ def build(
         say(_built(recipe, logs[0], read, output))
     _write_index(output, index)
     _tell_unread(unread, len(logs))
+
+
+def add(
+    set_file: SetArgument,
+    logs: Annotated[
+        list[Path],
+        typer.Argument(metavar="LOG...", help="Logs with poses in the frame of the set."),
+    ],
+    *,
+    rule: RuleOptions,
+    reading: LogOptions,
+    posing: PosesOptions,
+) -> None:
+    """Add references from more logs to a set, where it has none.
+
+    By the rule that the set was built by, unless another is named. A log is refused when its
+    scans do not fit the set where its poses say.
+    """
+    from ..io import open_log
+    from ..reference_set import ReferenceSet
+
+    if any(map(_is_map, logs)):
+        raise typer.BadParameter("a map is built from alone: it cannot be added")
+    with ReferenceSet.open(set_file) as places:
+        for path in logs:
+            log = open_log(path, **reading.reading(), **posing.posing())
+            refuse_mirrored(places, log)
+            refuse_another_frame(places, log)
+            before = len(places)
+            state = places.extend(
+                progress(records_of(log), "reading", log.count),
+                spacing=rule.spacing,
+                heading=rule.radians,
+                keep_all=rule.keep_all,
+            )
+            say(f"{set_file}: {len(places) - before} references added{_source(state)}")
+    _write_index(set_file, None)
 
 
 def _from_anywhere(poses: str | None) -> str | None:
@@ -197,14 +247,12 @@ def _built(recipe: _Recipe, source: Path, records: Iterable[Record], output: Pat
         path=output,
     ) as places:
         info = places.info()
-    return f"{output}: {info.references} references{_source(info)}"
+    told = "" if info.build is None else _source(info.build)
+    return f"{output}: {info.references} references{told}"
 
 
-def _source(info: SetInfo) -> str:
-    """Say what a set was built from."""
-    build = info.build
-    if build is None:
-        return ""
+def _source(build: BuildState) -> str:
+    """Say what was read for references."""
     parts = [f" from {build.consumed} scans"]
     if build.unusable:
         parts.append(f"{build.unusable} unusable")

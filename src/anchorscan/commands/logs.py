@@ -15,7 +15,15 @@ if TYPE_CHECKING:
     from ..record import Record
     from ..reference_set import ReferenceSet
 
-__all__ = ["problems", "record_of", "records_of", "records_shown", "refuse_mirrored", "stem"]
+__all__ = [
+    "problems",
+    "record_of",
+    "records_of",
+    "records_shown",
+    "refuse_another_frame",
+    "refuse_mirrored",
+    "stem",
+]
 
 # How many malformed lines a message names before it says "and so on".
 _NAMED_LINES = 5
@@ -89,6 +97,21 @@ def refuse_mirrored(places: ReferenceSet, log: Log) -> None:
             f"{found}: one of the two was recorded with "
             "the laser upside down, or was said to be (--upside-down)",
             log.path,
+        )
+
+
+def refuse_another_frame(places: ReferenceSet, log: Log) -> None:
+    """End where the poses of a log are not in the frame of a set, which it would spoil.
+
+    Raises:
+        LogError: The scans do not fit the set where their poses say.
+    """
+    from ..set_check import frame_check
+
+    found = frame_check(places, log)
+    if found.is_another:
+        raise LogError(
+            f"{found}: it is of another place, or its poses are in another frame", log.path
         )
 
 

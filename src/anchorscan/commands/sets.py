@@ -1,4 +1,4 @@
-"""``info``, ``index`` and ``check``: what a reference set holds, and whether it fits together."""
+"""``info``, ``index``, ``check`` and ``remove``: what a set holds, and whether it fits together."""
 
 from __future__ import annotations
 
@@ -8,13 +8,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from ..errors import ReferenceSetError
 from .console import FAILED, progress, say
 from .options import SetArgument, SettingsOptions
 
 if TYPE_CHECKING:
     from ..reference_set import SetInfo
 
-__all__ = ["check", "index", "info"]
+__all__ = ["check", "index", "info", "remove"]
 
 
 def info(
@@ -66,6 +67,24 @@ def check(
         bad = run(places, say=typer.echo, progress=progress)
     if bad:
         raise typer.Exit(FAILED)
+
+
+def remove(
+    set_file: SetArgument,
+    identifiers: Annotated[
+        list[int], typer.Argument(metavar="N...", min=0, help="References, as check numbers them.")
+    ],
+) -> None:
+    """Remove references from a set; their numbers are never used again."""
+    from ..reference_set import ReferenceSet
+
+    with ReferenceSet.open(set_file) as places:
+        for identifier in identifiers:
+            if identifier not in places:  # before any is removed
+                raise ReferenceSetError(f"{set_file}: has no reference {identifier}")
+        for identifier in dict.fromkeys(identifiers):
+            places.remove(identifier)
+        say(f"{set_file}: {len(places)} references left")
 
 
 _INDEX_STATES = {
