@@ -480,12 +480,16 @@ class TestCheck:
         way = np.array([[0.0, 0.0], [2.0, 0.0], [4.0, 3.0], [6.0, 0.0], [8.0, 0.0], [8.0, 2.0]])
         off = 2.0 * math.hypot(2.0, 3.0) - 4.0
         corner = 2.0 + 2.0 - math.hypot(2.0, 2.0)
-        expected = [0.0, 0.0, off, 0.0, corner, 0.0]
-        np.testing.assert_allclose(detours_of(way[:2]), [0.0, 0.0])
-        # Of six references two make a detour: too many for a way, unless it is longer.
+        expected = [0.0, 0.0, off, 0.0, corner, 0.0, 0.0]
+        way = np.append(way, [[8.0, 4.0]], axis=0)
+        # Of few references a single one may make more than a quarter longer; and none but it.
         assert not detours_of(way).any()
+        np.testing.assert_allclose(detours_of(way[:2]), [0.0, 0.0])
         longer = np.concatenate([np.arange(-40.0, 0.0, 2.0)[:, None] * (1.0, 0.0), way])
-        np.testing.assert_allclose(detours_of(longer)[-6:], expected)
+        np.testing.assert_allclose(detours_of(longer)[-7:], expected)
+        np.testing.assert_allclose(detours_of(longer[::-1])[:7], expected[::-1])
+        longer[0] = (-30.0, 9.0)  # whose sound neighbour is not to blame
+        np.testing.assert_allclose(detours_of(longer)[:20], np.zeros(20))
 
     def test_references_in_no_order_make_no_detour(self) -> None:
         assert not detours_of(np.random.default_rng(4).uniform(-20.0, 20.0, (90, 2))).any()

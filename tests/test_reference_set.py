@@ -9,6 +9,7 @@ import tempfile
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from enum import Enum
 from itertools import pairwise
 from pathlib import Path
 
@@ -20,6 +21,7 @@ from hypothesis.extra import numpy as hnp
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
 from anchorscan import (
+    AnchorscanError,
     LaserScan,
     Matcher,
     Pose2D,
@@ -443,6 +445,103 @@ class TestResume:
             with pytest.raises(ReferenceSetError, match=words):
                 ReferenceSet.build(records, **{"path": path, **change})
         assert (path.read_bytes(), by_hand.read_bytes()) == before
+
+
+class Places(str, Enum):
+    """Names that are no plain text."""
+
+    HALL = "hall"
+
+
+class TestOthers:
+    """What others have done to the file, and what the map cannot hold."""
+
+    @pytest.mark.parametrize("name", [np.array(["hall"])[0], Places.HALL])
+    def test_a_name_of_another_kind_is_stored_as_text(self, name: str, tmp_path: Path) -> None:
+        with ReferenceSet(path=tmp_path / "a.apr", name=name) as places:
+            places.add(SCAN, Pose2D(), name)
+        again = ReferenceSet.open(tmp_path / "a.apr")
+        assert (again.name, again[0].name) == ("hall", "hall")
+        with pytest.raises(ReferenceSetError, match="must be text"):
+            ReferenceSet(name=7)  # type: ignore[arg-type]
+
+    @pytest.mark.parametrize("path", [".", "/", ""])
+    def test_a_path_without_a_name_is_no_set(self, path: str) -> None:
+        with pytest.raises(ReferenceSetError, match="is a directory"):
+            ReferenceSet.open(path)
+
+    def test_a_set_in_use_refuses_what_its_map_cannot_hold(
+        self, drive: list[Record], tmp_path: Path
+    ) -> None:
+        with ReferenceSet.build(drive, path=tmp_path / "a.apr") as places:
+            asked = drive[3].scan
+            before, count = places.locate(asked)[0].pose, len(places)
+            with pytest.raises(ReferenceSetError, match=r"10000 km apart; is a pose wrong\?"):
+                places.add_batch([asked, asked], [Pose2D(), Pose2D(1e7, 0.0, 0.0)])
+            assert len(places) == len(ReferenceSet.open(tmp_path / "a.apr")) == count
+            assert places.locate(asked)[0].pose == before
+
+    def test_what_was_stored_before_the_set_was_used_can_be_removed_again(
+        self, drive: list[Record], tmp_path: Path
+    ) -> None:
+        with ReferenceSet.build(drive, path=tmp_path / "a.apr") as places:
+            far = places.add(SCAN, Pose2D(1e7, 0.0, 0.0))
+            for _ in range(2):
+                with pytest.raises(AnchorscanError, match="is a pose wrong"):
+                    places.locate(drive[3].scan)
+            places.remove(far)
+            assert places.locate(drive[3].scan)[0].accepted
+
+    @pytest.mark.parametrize("is_used", [True, False])
+    def test_a_set_whose_file_was_given_another_content_changes_nothing_there(
+        self, drive: list[Record], tmp_path: Path, is_used: bool
+    ) -> None:
+        places = ReferenceSet.build(drive, path=tmp_path / "a.apr")
+        if is_used:
+            places.locate(drive[3].scan)
+        other = ReferenceSet()
+        other.add(SCAN, Pose2D(), "other")
+        other.save(tmp_path / "a.apr")
+        for change in (lambda: places.add(SCAN, Pose2D()), lambda: places.remove(0)):
+            with pytest.raises(ReferenceSetError, match="another set than the one"):
+                change()
+        (left,) = ReferenceSet.open(tmp_path / "a.apr")
+        assert left.name == "other"
+        places.close()
+
+    def test_settings_and_name_that_others_stored_are_taken_over(
+        self, drive: list[Record], tmp_path: Path
+    ) -> None:
+        path = tmp_path / "a.apr"
+        places = ReferenceSet.build(drive, path=path)
+        assert not places.settings.decision.both_ways
+        assert places.locate(drive[3].scan)
+        assert not places.refresh()
+        both_ways = Settings.preset().changed({"decision": {"both_ways": True}})
+        ReferenceSet.open(path, settings=both_ways).save(path)
+        assert places.refresh()
+        assert places.settings.decision.both_ways
+        decision = places.explain(drive[3].scan).decision
+        assert decision is not None
+        assert math.isfinite(decision.upside_down)
+        renamed = ReferenceSet.open(path)
+        renamed.name = "office"
+        renamed.save(path)
+        assert places.refresh()
+        assert places.name == "office"
+
+    def test_numbers_of_numpy_name_references_with_and_without_an_index(
+        self, drive: list[Record], tmp_path: Path
+    ) -> None:
+        path = tmp_path / "a.apr"
+        with ReferenceSet.build(drive, path=path) as places:
+            (number,), _ = places.nearest(np.array([[1.0, 0.0, 0.0]]))
+            expected = meaning(places[number])
+            places.save_index()
+        indexed = ReferenceSet.open(path)
+        assert indexed.info().index == "current"
+        assert meaning(indexed[number]) == expected
+        assert number in indexed
 
 
 class TestExtend:

@@ -30,8 +30,8 @@ from reference_set_kills import BATCH, WAYS, check_bits, kill_many, pose_of, sca
 from anchorscan import LaserScan, Pose2D, Record, ReferenceSet, ReferenceSetError
 from anchorscan import set_file as set_file_module
 from anchorscan.set_file import (
-    _LAST_IDENTIFIER,
     FORMAT,
+    LAST_IDENTIFIER,
     Place,
     SetContent,
     SetFile,
@@ -702,12 +702,12 @@ def test_a_set_whose_numbers_are_used_up_takes_no_more_and_stays_sound(tmp_path:
         places.add(scan_of(0), pose_of(0))
     with closing(sqlite3.connect(path, isolation_level=None)) as connection:
         connection.execute("BEGIN")
-        header = replace(_load_header(connection), next_identifier=_LAST_IDENTIFIER - 1)
+        header = replace(_load_header(connection), next_identifier=LAST_IDENTIFIER - 1)
         _store_header(connection, header)
         connection.execute("COMMIT")
     with ReferenceSet.open(path) as places:
         told(path, "no number is left", lambda: places.add_batch([scan_of(1), scan_of(2)]))
-        assert places.add(scan_of(1), pose_of(1)) == _LAST_IDENTIFIER - 1
+        assert places.add(scan_of(1), pose_of(1)) == LAST_IDENTIFIER - 1
         told(path, "no number is left", lambda: places.add(scan_of(2), pose_of(2)))
     with ReferenceSet.open(path) as places:
         assert len(places) == 2

@@ -13,6 +13,7 @@ import subprocess
 import sys
 import threading
 import time
+import tracemalloc
 from collections.abc import Iterator
 from contextlib import contextmanager
 from http.client import HTTPConnection
@@ -36,13 +37,22 @@ from anchorscan import (
     Record,
     ReferenceSet,
     RemoteSet,
+    ScanError,
     ServiceError,
     SettingsError,
     drive,
     random_building,
 )
 from anchorscan.scan_message import BINARY, packed, scan_values
-from anchorscan.service import ServiceOptions, Token, application, read_tokens
+from anchorscan.service import (
+    _BATCH,
+    ServiceOptions,
+    Token,
+    _parsed,
+    application,
+    read_tokens,
+)
+from anchorscan.set_file import SetFile
 
 READ, WRITE = "read-0123456789abcdef", "write-0123456789abcdef"
 TOKENS = (Token(READ, False), Token(WRITE, True))
@@ -222,6 +232,50 @@ def test_a_set_replaced_while_it_is_asked_gives_no_mixed_answer(
     assert all(len(far) == 1 for far in seen.values()), seen
 
 
+def test_a_reference_that_no_map_can_hold_is_refused_before_it_is_stored(
+    folder: Path, scans: list[LaserScan]
+) -> None:
+    with serving(folder) as url, RemoteSet(url, "office") as office:
+        before, count = (
+            facts(office.locate(scans[0])),
+            len(ReferenceSet.open(folder / "office.apr")),
+        )
+        with pytest.raises(ServiceError, match="is a pose wrong") as refused:
+            office.add(scans[0], Pose2D(1e7, 0.0, 0.0))
+        assert str(folder) not in str(refused.value)
+        assert facts(office.locate(scans[0])) == before
+        assert len(ReferenceSet.open(folder / "office.apr")) == count
+
+
+def test_a_write_that_has_begun_is_waited_for(
+    folder: Path, scans: list[LaserScan], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    append = SetFile.append
+
+    def slowly(*values: Any, **named: Any) -> Any:
+        time.sleep(1.0)
+        return append(*values, **named)
+
+    monkeypatch.setattr(SetFile, "append", slowly)
+    count = len(ReferenceSet.open(folder / "office.apr"))
+    with serving(folder, seconds=0.5) as url, RemoteSet(url, "office") as office:
+        assert office.add(scans[0], Pose2D()) == count  # not told that it was not done
+    assert len(ReferenceSet.open(folder / "office.apr")) == count + 1
+
+
+def test_a_request_in_which_all_is_wrong_costs_no_more_than_its_size(folder: Path) -> None:
+    ranges = '","'.join(["x"] * 15_000)
+    scan = f'{{"angle_min":0,"angle_increment":0.0001,"ranges":["{ranges}"]}}'
+    body = f'{{"scans":[{",".join([scan] * 12)}]}}'
+    tracemalloc.start()
+    try:
+        with pytest.raises(ScanError, match="ranges"):
+            _parsed(_BATCH, body.encode())
+        assert tracemalloc.get_traced_memory()[1] < 4 * len(body)
+    finally:
+        tracemalloc.stop()
+
+
 def test_tokens_decide_who_may_do_what(folder: Path, scans: list[LaserScan]) -> None:
     with serving(folder, tokens=TOKENS) as url:
         assert ask(url, "GET", "/health")[0] == 200
@@ -377,6 +431,47 @@ def test_which_set_is_told_over_all_sets(folder: Path, scans: list[LaserScan]) -
     assert best
     assert {each["building"] for each in best} == {"office"}
     assert {each["version"] for each in best} == {versions["office"]}
+
+
+@pytest.mark.parametrize(
+    ("url", "token"),
+    [
+        ("http://[::1", None),
+        ("http://a..b:9", None),
+        ("ftp://a", None),
+        ("http://127.0.0.1:9", "t\u00f6ken"),
+        ("http://127.0.0.1:9", "two\nlines"),
+    ],
+)
+def test_an_address_or_a_token_that_can_be_none_is_refused(url: str, token: str | None) -> None:
+    with pytest.raises(ServiceError):
+        RemoteSet(url, "office", token=token)
+
+
+@pytest.mark.parametrize(
+    "answer",
+    [
+        {"answers": []},
+        {"hypotheses": [{"reference": 1e999}]},
+        {"identifiers": ["a"]},
+        {"identifiers": [None]},
+        {"identifiers": []},
+        {"identifiers": [0, 1]},
+        [],
+    ],
+)
+def test_an_answer_of_another_kind_is_an_error_in_one_line(
+    answer: Any, scans: list[LaserScan], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    data = json.dumps(answer).encode()
+    monkeypatch.setattr(RemoteSet, "_send", lambda *_, **__: (200, data))
+    office = RemoteSet("http://127.0.0.1:9", "office", token=f"{READ}\n")
+    for call in (office.locate, lambda scan: office.locate_batch([scan]), office.add):
+        with pytest.raises(ServiceError, match=r"another kind|asked for|as a service"):
+            call(scans[0])
+    monkeypatch.setattr(RemoteSet, "_send", lambda *_, **__: (200, b"[" * 100_000))
+    with pytest.raises(ServiceError, match="as a service"):
+        office.locate(scans[0])
 
 
 def test_a_client_without_a_service_says_so(scans: list[LaserScan]) -> None:

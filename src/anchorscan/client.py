@@ -40,26 +40,31 @@ class RemoteSet:
             stands.
         name: Of the set.
         token: What the service wants to see, if it does.
-        seconds: To wait for an answer.
+        seconds: To wait for the next part of an answer.
 
     Raises:
-        ServiceError: The address is none.
+        ServiceError: The address is none, or the token is not one line of printable ASCII.
     """
 
     def __init__(
         self, url: str, name: str, *, token: str | None = None, seconds: float = 30.0
     ) -> None:
-        parts = urlsplit(url)
         try:
+            parts = urlsplit(url)
             port = parts.port
-        except ValueError:
-            port = -1
-        if parts.scheme not in _SCHEMES or not parts.hostname or port == -1:
+            (parts.hostname or "").encode("idna")
+        except ValueError:  # UnicodeError is one
+            parts, port = urlsplit(""), None
+        if parts.scheme not in _SCHEMES or not parts.hostname:
             raise ServiceError(f"{url!r} is not the address of a service: http://host:port")
+        token = None if token is None else token.strip()  # of a file, it ends with a line feed
+        if token is not None and not (token.isascii() and token.isprintable()):
+            raise ServiceError("the token must be one line of printable ASCII")
         self.name = name
         self.version = ""
         self._address = (parts.scheme, parts.hostname, port)
-        self._place = f"{parts.path.rstrip('/')}/sets/{quote(name, safe='')}"
+        path = quote(parts.path.rstrip("/"), safe="/%")
+        self._place = f"{path}/sets/{quote(name, safe='')}"
         self._token = token
         self._seconds = seconds
         self._thread = threading.local()
@@ -82,7 +87,7 @@ class RemoteSet:
         if not scans:
             return []
         answer = self._ask("/locate-batch", BINARY, packed(scans))
-        return [self._hypotheses(each) for each in self._of(answer, "answers")]
+        return [self._hypotheses(each) for each in self._of(answer, "answers", len(scans))]
 
     def add(self, scan: LaserScan, pose: Pose2D | None = None, name: str = "") -> int:
         """Add a reference; it is on disk there when this returns.
@@ -133,7 +138,10 @@ class RemoteSet:
         except ValueError:
             raise ServiceError("the pose of a reference must be finite") from None
         answer = self._ask("/references", _JSON, body, is_question=False)
-        return [int(identifier) for identifier in self._of(answer, "identifiers")]
+        identifiers = self._of(answer, "identifiers", len(scans))
+        if not all(isinstance(each, int) for each in identifiers):
+            raise ServiceError(f"{self._where()}: an answer of another kind: no identifiers")
+        return list(identifiers)
 
     def close(self) -> None:
         """Close the connection of this thread; the next call opens another."""
@@ -160,7 +168,7 @@ class RemoteSet:
         status, data = self._send(self._place + path, body, headers, again=is_question)
         try:
             answer = json.loads(data)
-        except ValueError:
+        except (ValueError, RecursionError):
             answer = None
         if status >= 400 or not isinstance(answer, dict):
             raise ServiceError(f"{self._where()}: {_reason(status, answer)}")
@@ -195,13 +203,17 @@ class RemoteSet:
     def _hypotheses(self, answer: Any) -> list[Hypothesis]:
         try:
             return [hypothesis_of(each) for each in self._of(answer, "hypotheses")]
-        except ValueError as error:
+        except (ValueError, OverflowError) as error:
             raise ServiceError(f"{self._where()}: an answer of another kind: {error}") from None
 
-    def _of(self, answer: Any, name: str) -> Any:
-        if not isinstance(answer, dict) or not isinstance(answer.get(name), list):
+    def _of(self, answer: Any, name: str, count: int | None = None) -> list[Any]:
+        """Return a list of an answer, of so many values."""
+        found = answer.get(name) if isinstance(answer, dict) else None
+        if not isinstance(found, list):
             raise ServiceError(f"{self._where()}: an answer of another kind: no {name}")
-        return answer[name]
+        if count not in (None, len(found)):
+            raise ServiceError(f"{self._where()}: {len(found)} {name} where {count} were asked for")
+        return found
 
     def _where(self) -> str:
         scheme, host, port = self._address

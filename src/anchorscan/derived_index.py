@@ -26,6 +26,7 @@ must have the checksum that the set's file has for it.
 
 from __future__ import annotations
 
+import operator
 from bisect import bisect_left
 from collections.abc import Iterator, Mapping, MutableMapping, Sequence
 from dataclasses import dataclass
@@ -33,7 +34,7 @@ from functools import cache
 from hashlib import blake2b
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, SupportsIndex
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,9 +56,9 @@ _FORMAT = 2
 # Whoever changes one of these derives something else from the same references; the first names
 # the version.
 _STAGES = (
-    *("__init__", "scan", "angle_function", "segments", "anchors", "graph"),
+    *("__init__", "scan", "pose", "angle_function", "segments", "anchors", "graph"),
     *("length_relation", "oriented_relation", "database", "panorama", "spacing"),
-    *("evidence", "field", "proposal", "placed"),
+    *("description", "evidence", "tiles", "field", "proposal", "placed"),
 )
 _SECTIONS = ("method", "anchors", "graph", "database", "field")
 _PROPOSAL = ("shortest_edge", "longest_edge", "landmark_cell", "landmark_turn")
@@ -164,16 +165,15 @@ class IndexedReferences(MutableMapping[int, Reference]):
         return [self._added[identifier] for identifier in sorted(self._added)]
 
     def __getitem__(self, identifier: int) -> Reference:
-        if identifier in self._added:
-            return self._added[identifier]
         if identifier not in self:
             raise KeyError(identifier)
-        return self._index.read(identifier)
+        identifier = operator.index(identifier)
+        return self._added.get(identifier) or self._index.read(identifier)
 
     def __contains__(self, identifier: object) -> bool:
         if identifier in self._added:
             return True
-        if not isinstance(identifier, int) or identifier in self._gone:
+        if not isinstance(identifier, SupportsIndex) or identifier in self._gone:
             return False
         known = self._index.identifiers
         place = bisect_left(known, identifier)
@@ -198,7 +198,7 @@ class IndexedReferences(MutableMapping[int, Reference]):
 
 def index_path(path: Path) -> Path:
     """Return where the index of a set's file is."""
-    return path.with_name(f"{path.name}.index")
+    return path.parent / f"{path.name}.index"  # also of a path that has no name
 
 
 def write_index(

@@ -249,6 +249,23 @@ class LikelihoodField:
             _rows(self._codes, numbers),
         )
 
+    def check_room(self, poses: Iterable[Pose2D]) -> None:
+        """See that scans taken at some poses can be added.
+
+        Raises:
+            AnchorscanError: They lie too far from the origin, or from what there is.
+        """
+        positions = []
+        for pose in poses:
+            _check_pose(pose)
+            positions.append((pose.y, pose.x))  # rows before columns
+        if positions:
+            reach = self._settings.farthest + self._settings.reach
+            tile = _SIDE * self._settings.resolution
+            low = (np.min(positions, axis=0) - reach) / tile
+            high = (np.max(positions, axis=0) + reach) / tile
+            self._covering(np.floor(low) - 1, np.floor(high) + 2)
+
     def add(self, scan: LaserScan, pose: Pose2D) -> None:
         """Add what a scan taken at ``pose`` (``T_set_laser``) shows."""
         self._change(scan, pose, 1)
@@ -359,22 +376,32 @@ class LikelihoodField:
 
     def _cover(self, low: NDArray, high: NDArray) -> None:  # type: ignore[type-arg]
         """Widen the pages to all squares from ``low`` up to ``high``, rows before columns."""
-        low, high = np.floor(low / _PAGE), np.ceil(high / _PAGE)
-        old = np.array(self._corner), np.array(self._corner) + self._pages.shape
-        if self._is_placed:
-            low, high = np.minimum(low, old[0]), np.maximum(high, old[1])
-        shape = high - low
-        if float(shape[0]) * float(shape[1]) > _MOST_PAGES:
-            apart = float(shape.max()) * _PAGE * _SIDE * self._settings.resolution
-            raise AnchorscanError(f"references lie {apart / 1e3:.0f} km apart; is a pose wrong?")
+        low, shape = self._covering(low, high)
+        old = np.array(self._corner)
         if self._is_placed and tuple(shape.astype(int)) == self._pages.shape:
             return
         pages = np.zeros(shape.astype(int), np.int32)
         if self._is_placed:
-            i, j = (old[0] - low).astype(int)
+            i, j = (old - low).astype(int)
             pages[i : i + self._pages.shape[0], j : j + self._pages.shape[1]] = self._pages
         self._pages, self._corner = pages, (int(low[0]), int(low[1]))
         self._is_placed = True
+
+    def _covering(self, low: NDArray, high: NDArray) -> tuple[NDArray, NDArray]:  # type: ignore[type-arg]
+        """Return first page and number of the pages that cover squares and all that there is.
+
+        Raises:
+            AnchorscanError: They are too many.
+        """
+        low, high = np.floor(low / _PAGE), np.ceil(high / _PAGE)
+        if self._is_placed:
+            corner = np.array(self._corner)
+            low, high = np.minimum(low, corner), np.maximum(high, corner + self._pages.shape)
+        shape = high - low
+        if float(shape[0]) * float(shape[1]) > _MOST_PAGES:
+            apart = float(shape.max()) * _PAGE * _SIDE * self._settings.resolution
+            raise AnchorscanError(f"references lie {apart / 1e3:.0f} km apart; is a pose wrong?")
+        return low, shape
 
     def _derive_all(self, squares: NDArray[np.int64], dirty: NDArray[np.uint64]) -> None:
         """Derive the dirty blocks of many tiles, some at a time."""

@@ -218,7 +218,7 @@ class Fleet:
 def search(
     sets: Iterable[tuple[str, ReferenceSet]], description: Description
 ) -> Iterator[BuildingFits]:
-    """Search every set by itself; a set without a fit is passed over.
+    """Search every set by itself; a set without a fit, either way, is passed over.
 
     Args:
         sets: Names and sets.
@@ -229,14 +229,15 @@ def search(
     anchors, upside_down = len(description.anchors), None
     for name, places in sets:
         fits, settings = places.fits(description), places.settings
-        if fits is None or not len(fits):
+        if fits is None:
             continue
-        others = None
+        highest = -math.inf
         if settings.decision.both_ways:
             upside_down = upside_down or describe(description.scan.upside_down(), settings)
             others = places.fits(upside_down)
-        highest = -math.inf if others is None else others.highest_score
-        yield BuildingFits(name, anchors, fits[: settings.acceptance.hypotheses], highest)
+            highest = -math.inf if others is None else others.highest_score
+        if len(fits) or highest > -math.inf:
+            yield BuildingFits(name, anchors, fits[: settings.acceptance.hypotheses], highest)
 
 
 def decide_over(
@@ -258,7 +259,7 @@ def decide_over(
     Returns:
         Places in all buildings, best first, as many as one set gives at most.
     """
-    if not found:
+    if not any(len(each.fits) for each in found):
         return []
     best, fits = ranked(found)
     harder = settings.constant - look_alikes * math.log(max(sets, 1))

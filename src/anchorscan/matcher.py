@@ -241,6 +241,15 @@ class Matcher:
         """Whether there are references with poses that are searched as one map."""
         return len(self._map) > 0
 
+    def check_room(self, poses: Iterable[Pose2D]) -> None:
+        """See that references can be added at some poses ``T_set_laser``, before they are stored.
+
+        Raises:
+            AnchorscanError: They lie too far from the origin, or from the others.
+        """
+        if self.settings.method == "map":
+            self._map.check_room(poses)
+
     def add(self, reference: Reference) -> None:
         """Add a reference; searches that have begun do without it.
 

@@ -35,7 +35,7 @@ from .derived_index import (
     read_index,
     write_index,
 )
-from .errors import ReferenceSetError, SettingsError
+from .errors import AnchorscanError, ReferenceSetError, SettingsError
 from .hypothesis import Hypothesis
 from .pose import Pose2D
 from .record import Record
@@ -51,6 +51,7 @@ from .set_file import (
     SetChanges,
     SetContent,
     SetFile,
+    checksum_of,
     create_set,
     number,
     read_changes,
@@ -302,16 +303,19 @@ class ReferenceSet:
     @property
     def references(self) -> tuple[Reference, ...]:
         """The references in the order of their identifiers."""
-        if self._listed is None:
+        listed = self._listed
+        if listed is None:
             with self._lock:
-                self._listed = tuple(map(self._references.__getitem__, sorted(self._references)))
-        return self._listed
+                listed = tuple(map(self._references.__getitem__, sorted(self._references)))
+                self._listed = listed
+        return listed
 
     @property
     def has_poses(self) -> bool:
         """Whether every reference has a pose; those of an index have, and are not read for it."""
-        known = self._references
-        told = known.added if isinstance(known, IndexedReferences) else known.values()
+        with self._lock:
+            known = self._references
+            told = known.added if isinstance(known, IndexedReferences) else list(known.values())
         return all(reference.pose is not None for reference in told)
 
     def __len__(self) -> int:
@@ -486,7 +490,8 @@ class ReferenceSet:
             if self.path is None:
                 self[identifier]
             else:  # the file knows of those that others have added, too
-                self._writer().remove(identifier)
+                known = checksum_of(self[identifier]) if identifier in self else None
+                self._writer().remove(identifier, known)
             if identifier in self:
                 self._forget(identifier)
 
@@ -494,7 +499,7 @@ class ReferenceSet:
         """Take over what others have written to the file since it was read.
 
         Returns:
-            Whether anything had changed.
+            Whether references, settings or the name had changed.
 
         Raises:
             ReferenceSetError: As for ``open``.
@@ -512,13 +517,17 @@ class ReferenceSet:
                 self._adopt(content)  # not a later state of what was read, but another set
                 return True
             self._next_identifier, self._build = content.next_identifier, content.build
+            if self._given_settings is None and content.settings != self._stored_settings:
+                self._adopt(content)  # what was derived was derived with others
+                return True
+            is_renamed = content.name != self.name
             self.name, self._stored_settings = content.name, content.settings
             gone, new = old.keys() - shared, sorted(fresh.keys() - shared)
             for identifier in gone:
                 self._forget(identifier)
             for identifier in new:
                 self._remember(fresh[identifier])
-            return bool(gone or new)
+            return bool(gone or new or is_renamed)
 
     def locate(self, scan: LaserScan, candidates: Candidates = None) -> list[Hypothesis]:
         """Find where a scan may have been taken.
@@ -672,12 +681,12 @@ class ReferenceSet:
         return SetContent(self.name, settings, self._next_identifier, self.references, self._build)
 
     def _prepared(self) -> Matcher:
-        if self._matcher is None:
+        matcher = self._matcher
+        if matcher is None:
             with self._lock:
-                if self._matcher is None:
-                    matcher = self._indexed()
-                    self._matcher = self._derived() if matcher is None else matcher
-        return self._matcher
+                matcher = self._matcher or self._indexed() or self._derived()
+                self._matcher = matcher
+        return matcher
 
     def _derived(self) -> Matcher:
         from .matcher import Matcher
@@ -692,15 +701,15 @@ class ReferenceSet:
 
         try:
             matcher = Matcher.from_arrays(self._index.arrays, self.settings, self._index.read)
-        except (ValueError, KeyError, IndexError):
+            for identifier in self._references.gone:
+                matcher.remove(identifier)
+            for reference in self._references.added:
+                matcher.add(reference)
+        except (ValueError, KeyError, IndexError, AnchorscanError):
             # It contradicts itself: then it is as good as none, and its scans are no better.
             assert self.path is not None
             self._adopt(read_set(self.path))
             return None
-        for identifier in self._references.gone:
-            matcher.remove(identifier)
-        for reference in self._references.added:
-            matcher.add(reference)
         return matcher
 
     def _matched(self) -> tuple[tuple[Reference, ...], Settings]:
@@ -720,13 +729,26 @@ class ReferenceSet:
             if file is not None:
                 file.close()
 
+    def check_room(self, poses: Iterable[Pose2D | None]) -> None:
+        """See that references at some poses can be searched together with those that are there.
+
+        Raises:
+            ReferenceSetError: They lie too far from the origin, or from the others.
+        """
+        try:
+            self._prepared().check_room(pose for pose in poses if pose is not None)
+        except AnchorscanError as error:
+            raise ReferenceSetError(f"{self.path or 'the set'}: {error}") from None
+
     def _store(self, places: list[Place]) -> list[int]:
         """Add references in file and memory."""
         with self._lock:
+            if self._matcher is not None:  # a set in use stays of use
+                self.check_room(place.pose for place in places)
             if self.path is None:
                 references = number(places, self._next_identifier)
             else:
-                references = self._writer().append(places)
+                references = self._writer().append(places, known=self._next_identifier)
             for reference in references:
                 self._remember(reference)
             return [reference.identifier for reference in references]
@@ -796,7 +818,8 @@ class ReferenceSet:
         elif kept or os.path.lexists(self.path):
             if not os.path.lexists(self.path):
                 create_set(self.path, self._content())
-            for reference in self._writer().append(kept, state, self._build):
+            known = self._next_identifier
+            for reference in self._writer().append(kept, state, self._build, known):
                 self._remember(reference)
         self._build = state
 
@@ -804,14 +827,20 @@ class ReferenceSet:
         self._references[reference.identifier] = reference
         self._next_identifier = max(self._next_identifier, reference.identifier + 1)
         self._listed = None
-        if self._matcher is not None:
-            self._matcher.add(reference)
+        self._follow(lambda matcher: matcher.add(reference))
 
     def _forget(self, identifier: int) -> None:
         del self._references[identifier]
         self._listed = None
+        self._follow(lambda matcher: matcher.remove(identifier))
+
+    def _follow(self, change: Callable[[Matcher], None]) -> None:
+        """Have the matcher follow a change; where it cannot, the next search makes another."""
         if self._matcher is not None:
-            self._matcher.remove(identifier)
+            try:
+                change(self._matcher)
+            except (AnchorscanError, ValueError, KeyError):
+                self._matcher = None
 
 
 def _read_indexed(path: Path, settings: Settings | None) -> tuple[DerivedIndex, SetChanges] | None:

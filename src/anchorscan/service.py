@@ -283,8 +283,16 @@ class _Desk:
             await asyncio.get_running_loop().run_in_executor(self._thread, self._shelf.close)
         self._thread.shutdown()
 
-    async def do(self, work: Callable[[Shelf, float], Result], deadline: float) -> Result:
+    async def do(
+        self,
+        work: Callable[[Shelf, float], Result],
+        deadline: float,
+        *,
+        is_question: bool = True,
+    ) -> Result:
         """Do some work with the sets, in turn.
+
+        A change that has begun is waited for: who is told that it was not done would do it again.
 
         Raises:
             HTTPException: Too many wait already, or it was not done in time.
@@ -295,10 +303,13 @@ class _Desk:
         self._waiting += 1
         try:
             job = self._thread.submit(work, self._shelf, deadline)
+            result = asyncio.wrap_future(job)
             left = max(deadline - time.monotonic(), 0.001)
-            return await asyncio.wait_for(asyncio.wrap_future(job), left)
-        except asyncio.TimeoutError:
-            raise _too_slow(self.options) from None
+            await asyncio.wait([result], timeout=left)
+            if not result.done() and (is_question or job.cancel()):
+                result.cancel()
+                raise _too_slow(self.options)
+            return await result
         finally:
             self._waiting -= 1
 
@@ -358,7 +369,7 @@ def application(options: ServiceOptions) -> FastAPI:
     _tell_of_itself(app, counter)
     _keep_sets(app, counter)
     _locate_scans(app, counter)
-    _handle_errors(app)
+    _handle_errors(app, options.folder)
     app.add_middleware(_Gate, options=options, metrics=metrics)
     return app
 
@@ -457,7 +468,9 @@ def _keep_sets(app: FastAPI, at: _Counter) -> None:
         deadline = at.deadline
         _kind(request, _SQLITE, _OCTETS)
         data = await _read(request, at.options, deadline)
-        kept, is_new = await at.desk.do(lambda shelf, _: shelf.put(name, data), deadline)
+        kept, is_new = await at.desk.do(
+            lambda shelf, _: shelf.put(name, data), deadline, is_question=False
+        )
         answer = _shown(kept).model_dump()
         return JSONResponse(answer, 201 if is_new else 200)  # type: ignore[return-value]
 
@@ -478,7 +491,7 @@ def _keep_sets(app: FastAPI, at: _Counter) -> None:
             raise HTTPException(413, f"more than {at.options.most_scans} references at once")
         places = [each.place() for each in given]
         identifiers, version = await at.desk.do(
-            lambda shelf, until: _add(shelf, name, places, until), deadline
+            lambda shelf, until: _add(shelf, name, places, until), deadline, is_question=False
         )
         return AddedOut(version=version, identifiers=identifiers)
 
@@ -522,7 +535,7 @@ def _locate_scans(app: FastAPI, at: _Counter) -> None:
         "/which",
         tags=["locate"],
         dependencies=at.reading,
-        responses=_errors(408, 409, 413, 415, 422, 503),
+        responses=_errors(408, 413, 415, 422, 503),
         openapi_extra=_body({_JSON: _SCAN_SCHEMA, BINARY: _BYTES}),
     )
     async def which(request: Request) -> WhichOut:
@@ -593,13 +606,14 @@ def _list(shelf: Shelf, _: float) -> SetsOut:
 
 
 def _shown(kept: Kept) -> SetOut:
-    info = kept.places.info()
+    places, path = kept.places.references, kept.places.path
+    assert path is not None
     return SetOut(
         name=kept.name,
         version=kept.version,
-        references=info.references,
-        with_pose=info.with_pose,
-        bytes=info.size,
+        references=len(places),
+        with_pose=sum(each.pose is not None for each in places),
+        bytes=path.stat().st_size if path.exists() else None,
     )
 
 
@@ -685,8 +699,11 @@ def _allow(
         raise HTTPException(403, "this token may only read")
 
 
-def _handle_errors(app: FastAPI) -> None:
-    """Answer every error with one line."""
+def _handle_errors(app: FastAPI, folder: Path) -> None:
+    """Answer every error with one line, which does not say where the sets lie."""
+
+    def line(error: Exception) -> str:
+        return _line(error).replace(f"{folder}{os.sep}", "")
 
     async def refused(_: Request, error: Exception) -> Response:
         assert isinstance(error, AnyHTTPException)
@@ -699,10 +716,10 @@ def _handle_errors(app: FastAPI) -> None:
         return JSONResponse({"error": f"{where}: {first['msg']}"}, 422)
 
     async def unknown(_: Request, error: Exception) -> Response:
-        return JSONResponse({"error": _line(error)}, 404)
+        return JSONResponse({"error": line(error)}, 404)
 
     async def known(_: Request, error: Exception) -> Response:
-        return JSONResponse({"error": _line(error)}, 422)
+        return JSONResponse({"error": line(error)}, 422)
 
     async def mistake(request: Request, error: Exception) -> Response:
         _LOG.error("%s %s", request.method, request.url.path, exc_info=error)
@@ -817,7 +834,6 @@ _REASONS = {
     403: "The token may only read",
     404: "There is no such set",
     408: "The request came too slowly",
-    409: "The sets cannot be asked together",
     413: "The request is too large",
     415: "Another content type is needed",
     422: "What was sent makes no sense; the error says why",

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Annotated, Any, Literal, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, FailFast, Field
 
 from .pose import Pose2D
 from .scan import LaserScan
@@ -31,6 +31,11 @@ __all__ = [
     "WhichOut",
 ]
 
+Value = TypeVar("Value")
+# Of a list in which all is wrong, the first is told: to collect the errors takes far more memory
+# than the request.
+_Values = Annotated[list[Value], FailFast()]
+
 # What requests hold.  Strict: "1" is no number.
 
 
@@ -44,14 +49,14 @@ class ScanIn(BaseModel):
 
     angle_min: float
     angle_increment: float
-    ranges: list[float | Literal["inf", "-inf", "nan"] | None] = Field(max_length=MOST_READINGS)
+    ranges: _Values[float | Literal["inf", "-inf", "nan"] | None] = Field(max_length=MOST_READINGS)
     range_min: float = 0.0
     range_max: float | Literal["inf"] = 80.0
     header: dict[str, Any] | None = Field(None, description="passed over, as all below")
     angle_max: float | None = None
     time_increment: float | None = None
     scan_time: float | None = None
-    intensities: list[float | None] | None = None
+    intensities: list[Any] | None = None
 
     def scan(self) -> LaserScan:
         """Return what it stands for."""
@@ -66,7 +71,7 @@ class BatchIn(BaseModel):
 
     model_config = ConfigDict(strict=True, extra="forbid")
 
-    scans: list[ScanIn] = Field(min_length=1)
+    scans: _Values[ScanIn] = Field(min_length=1)
 
 
 class PoseIn(BaseModel):
@@ -99,7 +104,7 @@ class ReferencesIn(BaseModel):
 
     model_config = ConfigDict(strict=True, extra="forbid")
 
-    references: list[ReferenceIn] = Field(min_length=1)
+    references: _Values[ReferenceIn] = Field(min_length=1)
 
 
 # What answers hold.

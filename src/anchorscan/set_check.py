@@ -51,6 +51,8 @@ _DETOUR, _BORNE_OUT = 3.0, 0.8
 # References of which more than a quarter make the way longer by so much do not lie on one, metres;
 # nor do two that are more of its usual steps apart, between which one is left out.
 _ON_NO_WAY, _MOST_STEPS = 1.0, 3.0
+# Of fewer, a quarter make the way longer where a single one is misplaced.
+_SHORTEST_WAY = 12
 # Scans of a log that are judged, of so many at its beginning; how many of these, and which share,
 # have to be wrong for the frame to be.
 _LOOKED_AT, _ASKED = 400, 24
@@ -146,19 +148,23 @@ def detours_of(positions: NDArray[np.float64]) -> NDArray[np.float64]:
         positions: (N, 2) in the order of the way, metres.
 
     Returns:
-        (N,) metres; 0 for the ends, for one beside another that makes it longer still, for one
-        whose neighbours are far apart, as where one log follows another, and for all where the
-        order is no way: one that leads to and fro everywhere.
+        (N,) metres; 0 for the ends and those next to them, which may make a detour because an end
+        is misplaced, for one beside another that makes it longer still, for one whose neighbours
+        are far apart, as where one log follows another, and for all where the order is no way:
+        where more than a quarter make it longer by a metre, or where there are fewer than twelve.
     """
     lengths = np.hypot(*np.diff(positions, axis=0).T)
     straight = np.hypot(*(positions[2:] - positions[:-2]).T)
-    detours = np.zeros(len(positions) + 2)  # with one beyond either end
-    detours[2:-2] = lengths[:-1] + lengths[1:] - straight
-    if len(positions) < 3 or np.quantile(detours[2:-2], 0.75) > _ON_NO_WAY:
+    detours = np.zeros(len(positions))
+    detours[1:-1] = lengths[:-1] + lengths[1:] - straight
+    if len(positions) < _SHORTEST_WAY or np.quantile(detours[1:-1], 0.75) > _ON_NO_WAY:
         return np.zeros(len(positions))
-    detours[2:-2][straight > _MOST_STEPS * np.median(lengths)] = 0.0
-    is_largest = (detours[1:-1] >= detours[:-2]) & (detours[1:-1] >= detours[2:])
-    return np.where(is_largest, detours[1:-1], 0.0)
+    detours[1:-1][straight > _MOST_STEPS * np.median(lengths)] = 0.0
+    # The neighbours of one that is misplaced make a detour, too, and so does that of an end.
+    before, after = np.append(0.0, detours[:-1]), np.append(detours[1:], 0.0)
+    is_largest = (detours >= before) & (detours >= after)
+    is_largest[[1, -2]] = False
+    return np.where(is_largest, detours, 0.0)
 
 
 @dataclass(frozen=True)

@@ -28,7 +28,7 @@ from .errors import ReferenceSetError, ScanError
 from .pose import Pose2D
 from .reference import Reference
 from .scan import LaserScan
-from .set_file import MOST_READINGS, Place, SetContent
+from .set_file import LAST_IDENTIFIER, MOST_READINGS, Place, SetContent
 
 __all__ = ["read_directory", "write_directory"]
 
@@ -48,7 +48,7 @@ _COLUMNS = (
 )
 # What numpy lets through when the header of an array is nonsense.
 _BAD_ARRAY = (OSError, ValueError, OverflowError, SyntaxError, TypeError, TokenError)
-_IDENTIFIER = re.compile(r"[0-9]{1,15}", re.ASCII)
+_IDENTIFIER = re.compile(r"[0-9]{1,16}", re.ASCII)
 _LARGEST_DESCRIPTION = 1 << 22
 
 
@@ -152,8 +152,8 @@ def _read_description(path: Path) -> tuple[str, str, int]:
         raise ReferenceSetError(f"{path}: the name must be text")
     if not (isinstance(settings, dict) or settings is None):
         raise ReferenceSetError(f"{path}: the settings must be an object or null")
-    if not isinstance(following, int) or not 0 <= following < 10**15:
-        raise ReferenceSetError(f"{path}: next_identifier must be a number that is not negative")
+    if not isinstance(following, int) or not 0 <= following <= LAST_IDENTIFIER:
+        raise ReferenceSetError(f"{path}: next_identifier must be a number from 0 to 2^53")
     return name, "" if settings is None else json.dumps(settings), following
 
 
@@ -182,6 +182,8 @@ def _read_line(path: Path, row: dict[str, str | None]) -> Reference:
     if not _IDENTIFIER.fullmatch(values["identifier"]):
         raise ReferenceSetError(f"{values['identifier']!a} is not an identifier")
     identifier = int(values["identifier"])
+    if identifier >= LAST_IDENTIFIER:
+        raise ReferenceSetError(f"{identifier} is too large for an identifier")
     ranges = _read_ranges(_scan_path(path, identifier))
     geometry = (float(values[column]) for column in _COLUMNS[5:])
     place = Place(LaserScan(ranges, *geometry), _read_pose(values), values["name"])

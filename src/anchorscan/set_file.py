@@ -49,6 +49,7 @@ from .scan import LaserScan
 __all__ = [
     "APPLICATION",
     "FORMAT",
+    "LAST_IDENTIFIER",
     "LONGEST_NAME",
     "MOST_READINGS",
     "BuildState",
@@ -81,7 +82,7 @@ LONGEST_NAME = 4096
 _PAGE_SIZE = 8192
 _LONGEST_SETTINGS = 1 << 20
 _LARGEST_VALUE = 1 << 24
-_LAST_IDENTIFIER = 1 << 53
+LAST_IDENTIFIER = 1 << 53
 _PATIENCE = 5.0
 _CLOSING_PATIENCE = 1.0
 _PAUSE = 0.01
@@ -181,7 +182,7 @@ class Place:
             )
         if self.pose is not None and not self.pose.is_finite():
             raise ReferenceSetError(f"the pose of a reference must be finite, not {self.pose}")
-        _check_name(self.name)
+        object.__setattr__(self, "name", _plain_name(self.name))
 
 
 @dataclass(frozen=True)
@@ -228,7 +229,7 @@ class SetContent:
     build: BuildState | None = None
 
     def __post_init__(self) -> None:
-        _check_name(self.name)
+        object.__setattr__(self, "name", _plain_name(self.name))
         if len(self.settings.encode()) > _LONGEST_SETTINGS:
             raise ReferenceSetError(f"settings of over {_LONGEST_SETTINGS} bytes are refused")
 
@@ -296,6 +297,7 @@ class SetFile:
         places: Sequence[Place],
         build: BuildState | None = None,
         after: BuildState | None = None,
+        known: int = 0,
     ) -> list[Reference]:
         """Store references in one transaction.
 
@@ -303,16 +305,19 @@ class SetFile:
             places: What to store.
             build: Where the build stands with them; None leaves that as it is.
             after: Where the build must stand before, when ``build`` is given.
+            known: Identifiers below this one were used, as far as the writer knows.
 
         Returns:
             The references, with identifiers in rising order.
 
         Raises:
             ReferenceSetError: Nothing was stored: full disk, read-only or damaged file, another
-                writer, or another build of the same file.
+                writer, another build of the same file, or another set in its place.
         """
         with _told(self.path), self._transaction() as connection:
             header = _load_header(connection)
+            if header.next_identifier < known:
+                raise self._another()
             if build is not None:
                 if _load_build(connection) != after:
                     raise ReferenceSetError(f"{self.path}: another build is writing to this set")
@@ -324,11 +329,15 @@ class SetFile:
             _store_references(connection, header, references)
         return references
 
-    def remove(self, identifier: int) -> None:
+    def remove(self, identifier: int, checksum: int | None = None) -> None:
         """Remove a reference in one transaction.
 
+        Args:
+            identifier: Of the reference.
+            checksum: That it must have, if the writer knows it.
+
         Raises:
-            ReferenceSetError: It is not there, or the file cannot be written.
+            ReferenceSetError: It is not there, or is another one, or the file cannot be written.
         """
         with _told(self.path), self._transaction() as connection:
             header = _load_header(connection)
@@ -339,8 +348,12 @@ class SetFile:
                 ).fetchone()
             if row is None:
                 raise ReferenceSetError(f"{self.path}: there is no reference {identifier}")
+            if not _are(row, (int,)):
+                raise _DamageError(f"reference {identifier} has a checksum of the wrong kind")
+            if checksum not in (None, row[0]):
+                raise self._another()
             connection.execute("DELETE FROM reference WHERE identifier = ?", (identifier,))
-            content = header.content ^ int(row[0])
+            content = header.content ^ row[0]
             _store_header(connection, replace(header, count=header.count - 1, content=content))
 
     def replace(self, content: SetContent) -> None:
@@ -363,6 +376,11 @@ class SetFile:
         with _told(self.path), self._transaction() as connection:
             header = _load_header(connection)
             _store_header(connection, replace(header, name=name, settings=settings))
+
+    def _another(self) -> ReferenceSetError:
+        return ReferenceSetError(
+            f"{self.path}: holds another set than the one that was opened; open it again"
+        )
 
     def check(self) -> None:
         """See that the path still leads to the file that was opened.
@@ -442,7 +460,7 @@ def number(places: Sequence[Place], first: int) -> list[Reference]:
     Raises:
         ReferenceSetError: There are not so many identifiers.
     """
-    if first + len(places) > _LAST_IDENTIFIER:
+    if first + len(places) > LAST_IDENTIFIER:
         raise ReferenceSetError("no number is left for another reference of this set")
     return [
         Reference(first + i, place.scan, place.pose, place.name) for i, place in enumerate(places)
@@ -593,7 +611,15 @@ class _DamageError(Exception):
     """A file that contradicts itself; the message says where."""
 
 
-def _check_name(name: str) -> None:
+def _plain_name(name: str) -> str:
+    """Return a name as the file has it: a ``str``, and not a NumPy text or a member of an Enum.
+
+    Raises:
+        ReferenceSetError: It may not be a name.
+    """
+    if not isinstance(name, str):
+        raise ReferenceSetError(f"a name must be text, not {name!a}")
+    name = str.__str__(name)
     try:
         size = len(name.encode())
     except UnicodeEncodeError:
@@ -602,6 +628,7 @@ def _check_name(name: str) -> None:
         raise ReferenceSetError("a name must not hold the character NUL")
     if size > LONGEST_NAME:
         raise ReferenceSetError(f"a name has at most {LONGEST_NAME} bytes, not {size}")
+    return name
 
 
 # The files that this process has open to write, with how many times.  POSIX drops all locks of
@@ -835,7 +862,7 @@ def _load_header(connection: sqlite3.Connection) -> _Header:
     if not _are(values, (str, str, int, int, int)) or _seal(*values) != checksum:
         raise _DamageError("the description of the set fails its checksum")
     header = _Header(*values)
-    if not 0 <= header.next_identifier <= _LAST_IDENTIFIER:
+    if not 0 <= header.next_identifier <= LAST_IDENTIFIER:
         raise _DamageError(f"the next reference cannot be number {header.next_identifier}")
     return header
 

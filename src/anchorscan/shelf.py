@@ -102,7 +102,7 @@ class Shelf:
     def names(self) -> list[str]:
         """Name the sets that are in the folder now."""
         names = (path.name.removesuffix(_SUFFIX) for path in self.folder.glob(f"*{_SUFFIX}"))
-        return sorted(name for name in names if _NAME.match(name))
+        return sorted(name for name in names if _NAME.fullmatch(name))
 
     def take(self, name: str) -> Kept:
         """Give a set as its file has it now.
@@ -149,9 +149,11 @@ class Shelf:
 
         Raises:
             UnknownSetError: There is no such set.
-            ReferenceSetError: It cannot be written.
+            ReferenceSetError: It cannot be written, or not be searched with them.
         """
-        self.take(name).stamp = None  # whatever happens, look again
+        kept = self.take(name)
+        kept.places.check_room(place.pose for place in places)
+        kept.stamp = None  # whatever happens, look again
         # Past the set in memory, which another process may have overtaken.
         stored = self._writer(name).append(places)
         return [reference.identifier for reference in stored], self.take(name).version
@@ -192,13 +194,14 @@ class Shelf:
         inode, writer = self._writers.get(name, (None, None))
         if writer is None or now is None or inode != now[0]:
             if writer is not None:
-                writer.close()
+                with suppress(ReferenceSetError):  # that its file is another one is known
+                    writer.close()
             writer = SetFile(path)
             self._writers[name] = path.stat().st_ino, writer
         return writer
 
     def _path(self, name: str) -> Path:
-        if not _NAME.match(name):
+        if not _NAME.fullmatch(name):
             raise UnknownSetError("a name is up to 64 letters, digits, '_' and '-'")
         return self.folder / f"{name}{_SUFFIX}"
 

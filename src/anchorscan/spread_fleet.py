@@ -48,9 +48,9 @@ class SpreadFleet:
         settings: Settings to use instead of those in the files.
 
     Raises:
-        ReferenceSetError: A set cannot be opened, two have the same name, a folder has none, or
-            a set has references without a pose.
-        SettingsError: Two sets have different settings.
+        ReferenceSetError: Two sets have the same name, or a folder has none.
+        SettingsError: Two workers have sets of different settings.
+        AnchorscanError: A worker cannot open its sets, or ask them together.
     """
 
     def __init__(

@@ -242,6 +242,14 @@ class StitchedMap:
             return {}
         return {f"landmarks.{name}": each for name, each in lot.landmarks._asdict().items()}
 
+    def check_room(self, poses: Iterable[Pose2D]) -> None:
+        """See that references can be added at some poses.
+
+        Raises:
+            AnchorscanError: They lie too far from the origin, or from the others.
+        """
+        self._field.check_room(poses)
+
     def add(self, known: Known) -> None:
         """Add a reference that has a pose.
 
