@@ -99,16 +99,24 @@ def test_a_slip_is_told_from_another_place():
 def test_after_a_kidnapping_the_old_pose_must_go_within_two_metres():
     records = line(60)
     journey = Journey((*range(5), *range(40, 50)), jump=5)
-    old = {index: Pose2D(float(4 + index - 5)) for index in range(5, 7)}
+    before = {3: "right"}
+    old = before | {index: Pose2D(float(4 + index - 5)) for index in range(5, 7)}
     right = {index: "right" for index in range(9, 15)}
     quick = recovery(records, journey, reports(records, journey, {**old, **right}))
     assert (quick.withdrawn, quick.driven, quick.was_wrong) == (2.0, 4.0, False)
-    old = {index: Pose2D(float(4 + index - 5)) for index in range(5, 9)}
+    old = before | {index: Pose2D(float(4 + index - 5)) for index in range(5, 9)}
     slow = recovery(records, journey, reports(records, journey, {**old, **right}))
     assert (slow.withdrawn, slow.driven, slow.was_wrong) == (4.0, 4.0, True)
-    old = {index: Pose2D(float(4 + index - 5)) for index in range(5, 15)}
+    old = before | {index: Pose2D(float(4 + index - 5)) for index in range(5, 15)}
     stuck = recovery(records, journey, reports(records, journey, old))
     assert stuck.withdrawn == math.inf
+    old = before | {index: Pose2D(float(4 + index - 5)) for index in (5, 9)}
+    back = recovery(records, journey, reports(records, journey, {**old, 12: "right"}))
+    assert back.withdrawn == 5.0  # it came back after it was silent
+    at_once = recovery(records, journey, reports(records, journey, {**before, **right}))
+    assert at_once.withdrawn == 0.0
+    never_located = recovery(records, journey, reports(records, journey, right))
+    assert math.isnan(never_located.withdrawn)
 
 
 def test_every_record_needs_a_report():

@@ -62,7 +62,7 @@ class Recovery:
         was_far: The same of a confident pose that was more than 2 m off: another place, where
             less may be a slip, or a stretch where two passes of the log itself disagree.
         withdrawn: Metres from the jump until no pose of before it was reported any more;
-            infinite if that never ended, NaN without a jump.
+            infinite if that never ended, NaN where there was no jump or no pose before it.
     """
 
     driven: float
@@ -82,7 +82,8 @@ class RecoveryFigures:
         driven_90: 90th percentile of the same.
         was_wrong: Share that ever reported a confident wrong pose.
         was_far: Share that ever reported one that was more than 2 m off.
-        withdrawn: Share that withdrew the old pose within 2 m of the jump; NaN without a jump.
+        withdrawn: Share of those located before a jump that withdrew the old pose within 2 m of
+            it; NaN without a jump.
     """
 
     journeys: int
@@ -198,7 +199,8 @@ def recovery(records: Sequence[Record], journey: Journey, reports: Sequence[Answ
     allowed = -math.inf if journey.jump is None else _WITHDRAWN
     wrong = [r for m, r in later if m > allowed and r.accepted and not r.is_correct]
     far = any(_is_far(report) for report in wrong)
-    withdrawn = math.nan if journey.jump is None else _withdrawn(records, journey, later)
+    was_located = journey.jump is not None and any(each.accepted for each in reports[:begin])
+    withdrawn = _withdrawn(records, journey, later) if was_located else math.nan
     return Recovery(first, bool(wrong), far, withdrawn)
 
 
@@ -297,7 +299,7 @@ def metres_driven(records: Sequence[Record], journey: Journey) -> list[float]:
 def _withdrawn(
     records: Sequence[Record], journey: Journey, later: Sequence[tuple[float, Answer]]
 ) -> float:
-    """Return the metres up to the first report that no longer carries the old belief on.
+    """Return the metres up to the report after the last one that carries the old belief on.
 
     The old belief, carried on by odometry, is where the robot would be had it not been moved.
     """
@@ -305,10 +307,10 @@ def _withdrawn(
     T_map_old = _pose(records[journey.positions[jump - 1]])
     told = odometry(records, journey)
     T_old_start = told[jump - 1].inverse()
-    for index, (metres, report) in enumerate(later):
+    withdrawn = 0.0
+    for index, (_, report) in enumerate(later):
         carried_on = T_map_old @ T_old_start @ told[jump + index]
-        if not report.accepted or report.pose is None:
-            return metres
-        if report.pose.distance(carried_on) > 2.0 or report.is_correct:
-            return metres
-    return math.inf
+        pose = report.pose if report.accepted and not report.is_correct else None
+        if pose is not None and pose.distance(carried_on) <= _WITHDRAWN:
+            withdrawn = later[index + 1][0] if index + 1 < len(later) else math.inf
+    return withdrawn
