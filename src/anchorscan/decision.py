@@ -271,6 +271,7 @@ def _decided(features, hessians, residuals, counts, weights, deviations, others,
     known = held(_covariances(hessians[:1], residuals[:1], deviations)[0])
     threshold, most, twins, upside_down = answer
     told = (hessians[0, 2, 2], counts, weights, known, twins, upside_down)
+    # Which places are alike, they say themselves; what fits upside down speaks against them all.
     best = _likely(features, 1, told)
     alone, alike = best, 1
     while (

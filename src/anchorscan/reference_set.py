@@ -454,7 +454,7 @@ class ReferenceSet:
         """Add references from another log whose poses are in the frame of the set.
 
         Chosen as ``build`` does: where no reference lies within ``spacing`` and ``heading``.
-        They are stored as they come; one that is interrupted can be repeated.
+        They are stored as they come; one that is interrupted can be repeated, unless all is kept.
 
         Args:
             records: In any order.
