@@ -80,6 +80,8 @@ _LEVEL = math.radians(10.0)
 _ODOMETRY_DEPTH = 100
 # So long a scan waits for odometry that is on its way, seconds.
 _PATIENCE = 0.1
+# A report of a scan this much older than the newest one is not where the robot is now, seconds.
+_FRESH = 1.0
 _NANO = 1e-9
 _NAMED_HYPOTHESES = 3
 
@@ -129,6 +131,8 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
         autostart: Default of the parameter of that name.
         options: Passed on to the node.
     """
+
+    _newest: Any  # message of a scan
 
     def __init__(self, *, autostart: bool = False, **options: Any) -> None:
         super().__init__("anchorscan", **options)
@@ -182,6 +186,7 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
         with self._lock:
             self._start_over()
         self._is_active = True
+        self._newest = None  # heard before, and the robot may have been carried away meanwhile
         self._activated = self._heard = time.monotonic()
         return result
 
@@ -217,10 +222,11 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
         self._places: ReferenceSet | None = None
         self._robot: Robot | None = None
         self._report: Report | None = None
+        self._report_stamp: Any = None  # of the report, as the message of its scan gave it
         self._frames: _Frames | None = None
         self._map_digest = b""
         self._laser_frame = ""
-        self._newest: Any = None
+        self._newest = None
         self._activated = self._heard = -math.inf
         self._seconds = math.nan
         self._counts = {"scans": 0, "located": 0, "unusable": 0}
@@ -352,17 +358,19 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
         except ScanError as error:
             return False, f"the newest scan is unusable: {error}"
         with self._lock:
-            robot, last = self._robot, self._report
+            robot, last, last_stamp = self._robot, self._report, self._report_stamp
             doubt = "" if robot is None else robot.doubt
         if doubt:
             return False, f"the laser {doubt}"
-        odometry = None if robot is None else robot.odometry
+        odometry, stamp = None if robot is None else robot.odometry, message.header.stamp
         report = Robot(SingleScans(places), odometry).take(scan, self._stamp(message), T_base_laser)
         assert report is not None
-        if report.state != "located" and last is not None and last.state == "located":
-            report = last
+        # An idle node takes no scans: then the last report is of a place left long ago.
+        is_fresh = last is not None and abs(report.stamp - last.stamp) <= _FRESH
+        if report.state != "located" and last is not None and last.state == "located" and is_fresh:
+            report, stamp = last, last_stamp
         if report.state == "located":
-            self._announce(report, message.header.stamp)
+            self._announce(robot, report, stamp)
         return report.state == "located", _in_words(report)
 
     def _start_over_now(self, request: Any, response: Any) -> Any:
@@ -458,7 +466,7 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
             self._seconds = time.perf_counter() - begin
             if report is None:
                 return
-            self._report = report
+            self._report, self._report_stamp = report, message.header.stamp
             doubt = robot.doubt
         if doubt:
             self._complain("laser", f"{doubt}; see /tf, or laser_is_upside_down")
@@ -537,17 +545,18 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
             return
         self._counts["located"] += 1
         if not robot.is_announced and self._initial_pose.get_subscription_count():
-            self._announce(report, stamp)
-            robot.is_announced = True
+            self._announce(robot, report, stamp)
         if options.continuous:
             self._pose.publish(_pose_with_covariance(report, options.global_frame_id, stamp))
             self._broadcast(report, stamp, options)
 
-    def _announce(self, report: Report, stamp: Any) -> None:
+    def _announce(self, robot: Robot | None, report: Report, stamp: Any) -> None:
         options = self._options
         if options is None:
             return
         self._initial_pose.publish(_pose_with_covariance(report, options.global_frame_id, stamp))
+        if robot is not None and self._initial_pose.get_subscription_count():
+            robot.is_announced = True
         self.get_logger().info(f"told {options.initial_pose_topic}: {_in_words(report)}")
 
     def _broadcast(self, report: Report, stamp: Any, options: RobotParameters) -> None:
