@@ -147,6 +147,27 @@ def test_an_empty_map_knows_nothing(journey: list[Record]) -> None:
     assert {(b.pose, b.accepted, b.elsewhere) for b in beliefs} == {(None, False, 1.0)}
 
 
+@pytest.mark.parametrize("poseless", [False, True], ids=["none left", "one without a pose left"])
+def test_when_all_references_go_nothing_is_known_until_others_come(
+    journey: list[Record], poseless: bool
+) -> None:
+    known = [Reference(r.index, r.scan, r.pose) for r in journey[:60:5] if r.scan is not None]
+    places = Matcher(known)
+    localizer = Localizer(places)
+    assert fed(localizer, journey[:10])[-1].pose is not None
+    if poseless:
+        places.add(Reference(-1, known[0].scan))
+    for reference in known:
+        places.remove(reference.identifier)
+    belief = fed(localizer, journey[10:11])[0]
+    assert (belief.state, belief.hypotheses, belief.elsewhere) == ("lost", (), 1.0)
+    assert localizer.update(BLIND).hypotheses == ()
+    assert not len(localizer.mixture)
+    for reference in known:
+        places.add(reference)
+    assert any(belief.accepted for belief in fed(localizer, journey[11:40]))
+
+
 @settings(max_examples=12)
 @given(data=st.data())
 def test_no_odometry_clock_or_scan_breaks_the_belief(
