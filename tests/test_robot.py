@@ -218,6 +218,43 @@ def test_a_clock_that_goes_back_starts_over() -> None:
     assert robot.take(SCAN, 3.0) is not None
 
 
+def test_a_clock_that_goes_back_while_no_scan_is_taken_starts_over() -> None:
+    """As an idle node sees it: it takes scans no more, and a recording begins again."""
+    tracker = Fixed(0.9)
+    robot = Robot(tracker)
+    robot.take(SCAN, 10.0)
+    robot.is_announced = True
+    robot.watch_clock(221.0)
+    robot.watch_clock(220.5)
+    assert robot.is_announced
+    robot.watch_clock(12.0)
+    assert not robot.is_announced
+    assert tracker.resets == 1
+
+
+def test_a_scan_that_waited_while_others_were_seen_is_taken() -> None:
+    tracker = Fixed(0.9)
+    robot = Robot(tracker)
+    for stamp in (10.0, 11.0, 12.0, 13.0):
+        robot.watch_clock(stamp)
+    assert all(robot.take(SCAN, stamp) is not None for stamp in (10.0, 11.0, 12.0, 13.0))
+    assert tracker.resets == 0
+
+
+@pytest.mark.parametrize("stamp", [-math.inf, math.inf, math.nan])
+def test_a_scan_at_no_time_is_left_out(stamp: float) -> None:
+    tracker = Fixed(0.9)
+    robot = Robot(tracker)
+    robot.take(SCAN, 10.0)
+    robot.is_announced = True
+    robot.watch_clock(stamp)
+    assert robot.take(SCAN, stamp) is None
+    assert robot.take(SCAN, 10.1) is not None
+    assert robot.is_announced
+    assert tracker.resets == 0
+    assert robot.late == 1
+
+
 def test_broken_odometry_ends_the_belief_but_not_the_announcement() -> None:
     tracker = Fixed(0.9)
     robot = Robot(tracker)

@@ -187,7 +187,7 @@ class Robot:
         self._mirror = mirror
         self.odometry = odometry or Odometry()
         self._breaks = self.odometry.breaks
-        self._last = -math.inf
+        self._last = self._newest = -math.inf  # stamps: of scans taken, and of scans seen
         self.is_announced = False
         self.late = 0
 
@@ -202,11 +202,13 @@ class Robot:
         Returns:
             None for a scan that came too late or twice, or at no time.
         """
-        self.watch_clock(stamp)
-        if not self._last < stamp < math.inf:
+        # Not by the newest seen: a scan may have waited while others were seen.
+        if math.isfinite(stamp) and stamp <= self._last - _CLOCK_JUMP:
+            self.start_over()
+        if not (math.isfinite(stamp) and self._last < stamp):
             self.late += 1
             return None
-        self._last = stamp
+        self._last, self._newest = stamp, max(self._newest, stamp)
         if self.odometry.breaks != self._breaks:
             self._breaks = self.odometry.breaks
             self._tracker.reset()
@@ -228,15 +230,18 @@ class Robot:
 
     def watch_clock(self, stamp: float) -> None:
         """Start over when the time of a scan, taken or not, shows that the clock went back."""
-        if stamp <= self._last - _CLOCK_JUMP:
+        if not math.isfinite(stamp):
+            return
+        if stamp <= self._newest - _CLOCK_JUMP:
             self.start_over()
+        self._newest = max(self._newest, stamp)
 
     def start_over(self) -> None:
         """Forget where the robot is, and that anybody was told."""
         self._tracker.reset()
         if self._mirror is not None:
             self._mirror.reset()
-        self._last = -math.inf
+        self._last = self._newest = -math.inf
         self.is_announced = False
 
 
