@@ -243,3 +243,38 @@ def test_a_pose_that_was_asked_for_is_not_told_once_more(make: Callable[..., Any
     node._initial_pose.get_subscription_count.return_value = 1
     hear(node, 10.1)
     assert [seconds(message) for message in told(node)] == [10.0, 10.1]
+
+
+# What diagnostics say
+
+
+class Meddling(str):
+    """A topic or a reason that another thread mends in the very moment in which it is told."""
+
+    node: Any = None
+
+    def __format__(self, how: str) -> str:
+        if self.node is not None:
+            self.node._mend("scan")
+            self.node._mend("map")
+        return str(self)
+
+
+def test_a_complaint_that_changes_while_it_is_told_does_not_end_the_node(
+    make: Callable[..., Any],
+) -> None:
+    node = make()
+    reason, topic = Meddling("is unusable"), Meddling("scan")
+    node._heard = math.inf
+    node._complain(topic, reason)
+    node._complain("map", "is unusable")
+    reason.node = topic.node = node
+    node._diagnose()
+    (array,) = node._diagnostics.publish.call_args.args
+    (status,) = array.status
+    assert status.message == "the scan is unusable"
+    said = {each.key: each.value for each in status.values}
+    assert {key for key in said if key.startswith("problem")} == {"problem: scan", "problem: map"}
+    node._diagnose()
+    (array,) = node._diagnostics.publish.call_args.args
+    assert not [each.key for each in array.status[0].values if each.key.startswith("problem")]

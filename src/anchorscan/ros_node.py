@@ -18,7 +18,7 @@ import sys
 import threading
 import time
 import traceback
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -147,6 +147,7 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
         self._worker: threading.Thread | None = None
         self._is_active = False
         self._lock = threading.Lock()  # of robot, report and places
+        self._complaining = threading.Lock()  # of changes to complaints
         self._forget()
 
     # Transitions
@@ -230,8 +231,9 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
         self._activated = self._heard = -math.inf
         self._seconds = math.nan
         self._counts = {"scans": 0, "located": 0, "unusable": 0}
-        # What is wrong with a topic, by its name; mended by the next good message.
-        self._complaints: dict[str, str] = {}
+        # What is wrong with a topic, by its name; mended by the next good message.  Never changed
+        # but replaced: one thread changes what another goes through.
+        self._complaints: Mapping[str, str] = {}
 
     def _read_parameters(self) -> RobotParameters:
         values: dict[str, Any] = {}
@@ -575,25 +577,34 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
 
     def _complain(self, topic: str, reason: str) -> None:
         """Say what is wrong with a topic: in the log when it is new, else in diagnostics."""
-        if self._complaints.get(topic) != reason:
-            self._complaints[topic] = reason
+        with self._complaining:
+            is_new = self._complaints.get(topic) != reason
+            self._complaints = {**self._complaints, topic: reason}
+        if is_new:
             self.get_logger().warning(f"{topic}: {reason}")
 
     def _mend(self, topic: str) -> None:
-        if self._complaints.pop(topic, None) is not None:
+        with self._complaining:
+            is_mended = topic in self._complaints
+            if is_mended:
+                left = {each: why for each, why in self._complaints.items() if each != topic}
+                self._complaints = left
+        if is_mended:
             self.get_logger().info(f"{topic}: all right again")
 
     def _reason(self, topic: str) -> str:
-        return f": the {topic} {self._complaints[topic]}" if topic in self._complaints else ""
+        reason = self._complaints.get(topic)
+        return "" if reason is None else f": the {topic} {reason}"
 
     def _diagnose(self) -> None:
         options, mailbox = self._options, self._mailbox
         if options is None or mailbox is None:
             return
+        complaints = self._complaints
         status = DiagnosticStatus()
         status.name = f"{self.get_name()}: localization"
         status.hardware_id = options.base_frame_id
-        status.level, status.message = next(self._summary(options))
+        status.level, status.message = next(self._summary(options, complaints))
         values: dict[str, Any] = {
             "references": 0 if self._places is None else len(self._places),
             **{f"scans {what}": count for what, count in self._counts.items()},
@@ -601,7 +612,7 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
             "scans late": 0 if self._robot is None else self._robot.late,
             "told": self._robot is not None and self._robot.is_announced,
             "query milliseconds": f"{1e3 * self._seconds:.2f}",
-            **{f"problem: {topic}": reason for topic, reason in self._complaints.items()},
+            **{f"problem: {topic}": reason for topic, reason in complaints.items()},
         }
         report = self._report
         if report is not None:
@@ -616,26 +627,28 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
         array.status = [status]
         self._diagnostics.publish(array)
 
-    def _summary(self, options: RobotParameters) -> Iterator[tuple[bytes, str]]:
+    def _summary(
+        self, options: RobotParameters, complaints: Mapping[str, str]
+    ) -> Iterator[tuple[bytes, str]]:
         """Yield levels and messages; the first is what keeps the robot from being located."""
         ok, warning, error = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
         if not self._is_active:
             yield ok, "inactive"
-        if "node" in self._complaints:
-            yield error, f"the node {self._complaints['node']}"
-        if self._places is None and "map" in self._complaints:
-            yield error, f"no map{self._reason('map')}"
+        if "node" in complaints:
+            yield error, f"the node {complaints['node']}"
+        if self._places is None and "map" in complaints:
+            yield error, f"no map: the map {complaints['map']}"
         if self._places is None:
             yield warning, f"waiting for a map on {options.map_topic}"
         silence = time.monotonic() - self._heard
         if silence > options.scan_timeout:
             yield error, f"no scan on {options.scan_topic} for {silence:.0f} s"
-        if "scan" in self._complaints:
-            yield warning, f"the scan {self._complaints['scan']}"
-        if "laser" in self._complaints:
-            yield error, f"the laser {self._complaints['laser']}"
-        if "map" in self._complaints:
-            yield warning, f"the map {self._complaints['map']}; the old one is used"
+        if "scan" in complaints:
+            yield warning, f"the scan {complaints['scan']}"
+        if "laser" in complaints:
+            yield error, f"the laser {complaints['laser']}"
+        if "map" in complaints:
+            yield warning, f"the map {complaints['map']}; the old one is used"
         if self._robot is not None and self._robot.is_announced and not options.continuous:
             yield ok, "located and told; idle until asked"
         report = self._report
