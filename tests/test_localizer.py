@@ -17,6 +17,9 @@ from anchorscan import (
     Pose2D,
     Record,
     Reference,
+    ReferenceSetError,
+    Settings,
+    SettingsError,
     drive,
     random_building,
 )
@@ -166,6 +169,24 @@ def test_when_all_references_go_nothing_is_known_until_others_come(
     for reference in known:
         places.add(reference)
     assert any(belief.accepted for belief in fed(localizer, journey[11:40]))
+
+
+def test_settings_that_make_no_map_are_refused_with_what_to_do() -> None:
+    places = Matcher((), Settings.preset("paper"))
+    with pytest.raises(SettingsError, match="use those of the preset default"):
+        Localizer(places)
+
+
+def test_references_without_poses_are_refused_with_what_to_do(journey: list[Record]) -> None:
+    places = Matcher()
+    localizer = Localizer(places)
+    assert fed(localizer, journey[:1])[0].state == "lost", "they may come later"
+    assert journey[0].scan is not None
+    places.add(Reference(0, journey[0].scan))
+    with pytest.raises(ReferenceSetError, match="TopologicalLocalizer"):
+        fed(localizer, journey[1:2])
+    places.add(Reference(1, journey[1].scan, journey[1].pose))  # type: ignore[arg-type]
+    assert fed(localizer, journey[2:3])[0].pose is not None
 
 
 @settings(max_examples=12)

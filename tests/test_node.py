@@ -144,6 +144,7 @@ def ros_node() -> Iterator[Any]:
     stand_ins["rclpy.time"].Time.from_msg = lambda stamp: stamp.sec + 1e-9 * stamp.nanosec
     stand_ins["nav_msgs.msg"].OccupancyGrid = type("OccupancyGrid", (), {})
     stand_ins["geometry_msgs.msg"].PoseWithCovarianceStamped = mock.MagicMock
+    stand_ins["rclpy.lifecycle"].TransitionCallbackReturn.FAILURE = "failure"
     stand_ins["diagnostic_msgs.msg"].KeyValue = SimpleNamespace
     name = "anchorscan.ros_node"
     # Not by mock.patch.dict, which would also forget what else is imported for the first time.
@@ -278,3 +279,15 @@ def test_a_complaint_that_changes_while_it_is_told_does_not_end_the_node(
     node._diagnose()
     (array,) = node._diagnostics.publish.call_args.args
     assert not [each.key for each in array.status[0].values if each.key.startswith("problem")]
+
+
+# What it is not configured with
+
+
+def test_settings_that_make_no_map_keep_it_from_being_configured(ros_node: Any) -> None:
+    node = ros_node.LocalizationNode()
+    node.parameters["preset"] = "paper"
+    assert node.on_configure(None) == "failure"
+    (words,) = node.logger.error.call_args.args
+    assert "not configured" in words
+    assert "use those of the preset default" in words

@@ -166,8 +166,9 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
                     raise SettingsError(f"{options.set_file} has no poses in a common frame")
             else:
                 places = ReferenceSet(settings=settings)
+            localizer = Localizer(places)  # refuses settings that make no map
             places.prepare()
-            Localizer(places).prepare()
+            localizer.prepare()
             if options.set_file:
                 self._adopt(places)
         except AnchorscanError as error:
