@@ -87,6 +87,28 @@ def test_odometry_far_from_every_message_is_not_known() -> None:
     assert odometry.at(9.0) is None
 
 
+def test_between_messages_far_apart_odometry_is_not_known() -> None:
+    odometry = Odometry()
+    odometry.add(0.0, Pose2D())
+    odometry.add(9.9, Pose2D(9.0))
+    assert odometry.at(5.0) is None
+    assert odometry.at(0.2) == Pose2D()
+    assert odometry.at(9.8) == Pose2D(9.0)
+    assert odometry.at(9.9) == Pose2D(9.0)
+
+
+def test_a_heading_that_jumps_breaks_the_odometry_and_a_fast_turn_does_not() -> None:
+    odometry = Odometry()
+    odometry.add(0.0, Pose2D(0.2, 0.0, 3.0))
+    for k in range(1, 40):  # 4 rad/s, on through the other side
+        odometry.add(0.05 * k, Pose2D(0.2, 0.0, 3.0 + 0.2 * k))
+    assert odometry.breaks == 0
+    before = odometry.at(0.05 * 39)
+    assert before is not None
+    odometry.add(2.0, Pose2D(0.2, 0.0, before.theta + 3.0))
+    assert odometry.breaks == 1
+
+
 def test_wheels_that_begin_again_from_zero_break_the_odometry() -> None:
     odometry = Odometry()
     odometry.add(10.0, Pose2D(20.0))

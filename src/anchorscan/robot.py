@@ -43,11 +43,13 @@ _CLOCK_JUMP = 1.0
 # Odometry is kept for this long, and held to be true for so long before and after, seconds.
 _MEMORY = 10.0
 _REACH = 0.25
-# Odometry this much older than a scan has stopped, seconds.
+# Odometry this much older than a scan has stopped, and what was between two messages farther
+# apart is not known, seconds.
 _LATE = 1.0
 # Farther than this and faster than this no robot drives between two messages, metres, and a
-# second.
+# second; nor does it turn more than this, radians, and a second.
 _JUMP, _SPEED = 0.5, 5.0
+_TURN_JUMP, _TURN_SPEED = 1.0, 6.0
 
 
 class Tracker(Protocol):
@@ -122,6 +124,7 @@ class Odometry:
                 last, before = self._samples[-1]
                 passed = stamp - last
                 jumped = before.distance(T_odom_base) > _JUMP + _SPEED * abs(passed)
+                jumped |= before.turn(T_odom_base) > _TURN_JUMP + _TURN_SPEED * abs(passed)
                 if -_CLOCK_JUMP < passed <= 0.0 and not jumped:
                     return
                 if passed <= -_CLOCK_JUMP or jumped:
@@ -149,10 +152,12 @@ class Odometry:
         with self._lock:
             samples = tuple(self._samples)
         after = next((k for k, sample in enumerate(samples) if sample[0] >= stamp), len(samples))
-        if 0 < after < len(samples):
-            return _between(samples[after - 1], samples[after], stamp)
-        nearest = samples[min(after, len(samples) - 1)] if samples else (math.inf, Pose2D())
-        return nearest[1] if abs(nearest[0] - stamp) <= _REACH else None
+        beside = samples[max(after - 1, 0) : after + 1]
+        if len(beside) == 2 and beside[1][0] - beside[0][0] <= _LATE:
+            return _between(beside[0], beside[1], stamp)
+        nearest = min(beside, key=lambda sample: abs(sample[0] - stamp), default=None)
+        is_near = nearest is not None and abs(nearest[0] - stamp) <= _REACH
+        return nearest[1] if nearest is not None and is_near else None
 
     def clear(self) -> None:
         """Forget everything."""
