@@ -69,6 +69,7 @@ class Frames:
 
     def __init__(self) -> None:
         self.odometry: Callable[[float | None], Pose2D | None] = lambda when: None
+        self.heard = -math.inf
 
     def motion(self, target: str, source: str, when: Any = None) -> Any:
         from anchorscan.io.spatial import from_pose
@@ -77,6 +78,9 @@ class Frames:
             return np.eye(4)
         pose = self.odometry(when)
         return None if pose is None else from_pose(pose)
+
+    def newest(self, target: str, source: str) -> float:
+        return self.heard
 
 
 class Places:
@@ -244,6 +248,70 @@ def test_a_pose_that_was_asked_for_is_not_told_once_more(make: Callable[..., Any
     node._initial_pose.get_subscription_count.return_value = 1
     hear(node, 10.1)
     assert [seconds(message) for message in told(node)] == [10.0, 10.1]
+
+
+# Where odometry comes from
+
+
+def driven(when: float | None) -> Pose2D:
+    """A robot that drives half a metre and turns 0.8 rad in a second."""
+    assert when is not None
+    return Pose2D(0.5 * (when - 10.0), 0.0, 0.8 * (when - 10.0))
+
+
+def test_odometry_of_tf_is_that_of_the_time_of_every_scan_and_not_waited_for(
+    make: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    node = make(continuous=True)
+    node._frames.odometry = driven
+    waited = mock.MagicMock()
+    monkeypatch.setattr(node._robot.odometry, "wait_until", waited)
+    stamps = [10.0 + 0.125 * k for k in range(12)]
+    for stamp in stamps:
+        hear(node, stamp)
+    for (stamp, odometry), expected in zip(node._robot._tracker.fed, stamps, strict=True):
+        assert stamp == expected
+        assert odometry is not None
+        assert odometry.distance(driven(stamp)) < 1e-9
+        assert odometry.turn(driven(stamp)) < 1e-9
+    assert not waited.called
+
+
+def test_odometry_of_tf_that_is_on_its_way_is_waited_for_and_no_other(
+    make: Callable[..., Any], ros_node: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    node = make(continuous=True)
+    frames, pauses = node._frames, []
+    frames.odometry = lambda when: driven(when) if when <= frames.heard else None
+
+    def pause(seconds: float) -> None:
+        pauses.append(seconds)
+        frames.heard += 0.05
+
+    monkeypatch.setattr(ros_node.time, "sleep", pause)
+    frames.heard = 9.875
+    hear(node, 10.0)
+    assert node._robot._tracker.fed[-1][1] is not None
+    assert len(pauses) == 3
+    hear(node, 20.0)  # it has stopped
+    assert node._robot._tracker.fed[-1] == (20.0, None)
+    assert len(pauses) == 3
+
+
+def test_where_the_topic_tells_the_odometry_tf_is_not_asked(make: Callable[..., Any]) -> None:
+    node = make(continuous=True)
+    node._frames.odometry = mock.MagicMock(return_value=Pose2D(7.0))
+    node._take_odometry(odometry_message(10.0, Pose2D(1.0)))
+    node._take_odometry(odometry_message(10.2, Pose2D(1.1)))
+    hear(node, 10.1)
+    moved = node._robot._tracker.fed[-1][1]
+    assert moved is not None
+    assert moved.distance(Pose2D(1.05)) < 1e-9
+    assert not node._frames.odometry.called
+    # A topic that has gone silent is replaced.
+    node._odometry_heard -= 5.0
+    hear(node, 15.0)
+    assert node._robot._tracker.fed[-1][1] == Pose2D(7.0)
 
 
 # What diagnostics say

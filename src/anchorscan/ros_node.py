@@ -78,8 +78,10 @@ __all__ = ["LocalizationNode", "main"]
 # A laser that tilts more than this does not see the walls of a plan, radians.
 _LEVEL = math.radians(10.0)
 _ODOMETRY_DEPTH = 100
-# So long a scan waits for odometry that is on its way, seconds.
-_PATIENCE = 0.1
+# So long a scan waits for odometry that is on its way, seconds, and so often it looks for it.
+_PATIENCE, _PAUSE = 0.1, 0.01
+# Odometry this much older than now or than a scan has stopped, seconds.
+_STOPPED = 1.0
 # A report of a scan this much older than the newest one is not where the robot is now, seconds.
 _FRESH = 1.0
 _NANO = 1e-9
@@ -105,14 +107,24 @@ class _Frames:
 
     def motion(self, target: str, source: str, when: Any = None) -> NDArray[np.float64] | None:
         """Return the (4, 4) ``T_target_source`` at a time (the latest if None), if known."""
-        if self._buffer is None:
-            return None
-        try:
-            found = self._buffer.lookup_transform(target, source, when or Time())
-        except tf2_ros.TransformException:
+        found = self._found(target, source, when)
+        if found is None:
             return None
         place, turn = found.transform.translation, found.transform.rotation
         return matrix_of(np.array([place.x, place.y, place.z, turn.x, turn.y, turn.z, turn.w]))
+
+    def newest(self, target: str, source: str) -> float:
+        """Return the time of the latest motion, seconds; minus infinity if none is known."""
+        found = self._found(target, source, None)
+        return -math.inf if found is None else _seconds(found.header.stamp)
+
+    def _found(self, target: str, source: str, when: Any) -> Any:
+        if self._buffer is None:
+            return None
+        try:
+            return self._buffer.lookup_transform(target, source, when or Time())
+        except tf2_ros.TransformException:
+            return None
 
     def broadcast(self, transform: Any) -> None:
         if self._broadcaster is not None:
@@ -229,7 +241,7 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
         self._map_digest = b""
         self._laser_frame = ""
         self._newest = None
-        self._activated = self._heard = -math.inf
+        self._activated = self._heard = self._odometry_heard = -math.inf
         self._seconds = math.nan
         self._counts = {"scans": 0, "located": 0, "unusable": 0}
         # What is wrong with a topic, by its name; mended by the next good message.  Never changed
@@ -336,6 +348,7 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
             self._complain("odometry", "holds no pose")
             return
         self._mend("odometry")
+        self._odometry_heard = time.monotonic()
         robot.odometry.add(_seconds(message.header.stamp), T_odom_base)
 
     def _take_map(self, message: Any) -> None:
@@ -458,13 +471,12 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
             return
         self._mend("scan")
         if (waiting := self._robot) is not None:
-            waiting.odometry.wait_until(self._stamp(message), _PATIENCE)
+            self._await_odometry(waiting, message)
         begin = time.perf_counter()
         with self._lock:
             robot = self._robot
             if robot is None:
                 return
-            self._odometry_from_tf(robot, message)
             report = robot.take(scan, self._stamp(message), T_base_laser)
             self._seconds = time.perf_counter() - begin
             if report is None:
@@ -518,15 +530,35 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
             )
         return Pose2D(*options.laser_pose), options.laser_is_upside_down
 
-    def _odometry_from_tf(self, robot: Robot, message: Any) -> None:
-        """Let tf2 tell the odometry where no topic does."""
-        options, stamp = self._options, self._stamp(message)
-        if self._frames is None or options is None or robot.odometry.at(stamp) is not None:
+    def _await_odometry(self, robot: Robot, message: Any) -> None:
+        """Have odometry come as far as a scan: by its topic or, where that is silent, by tf2.
+
+        Never by both: what filters tell tf2 drifts otherwise than the wheels do.
+        """
+        stamp = self._stamp(message)
+        if time.monotonic() - self._odometry_heard < _STOPPED:
+            robot.odometry.wait_until(stamp, _PATIENCE)
             return
-        when = Time.from_msg(message.header.stamp)
-        motion = self._frames.motion(options.odom_frame_id, options.base_frame_id, when)
+        motion = self._motion_from_tf(message.header.stamp, stamp)
         if motion is not None:
             robot.odometry.add(stamp, planar(motion))
+        elif self._odometry_heard > -math.inf:  # the topic was silent, and may go on just now
+            robot.odometry.wait_until(stamp, _PATIENCE)
+
+    def _motion_from_tf(self, when: Any, stamp: float) -> NDArray[np.float64] | None:
+        """Return the (4, 4) ``T_odom_base`` at the time of a scan, if tf2 comes to know it."""
+        options, frames = self._options, self._frames
+        if frames is None or options is None:
+            return None
+        odom, base = options.odom_frame_id, options.base_frame_id
+        end = time.monotonic() + _PATIENCE
+        while True:
+            motion = frames.motion(odom, base, Time.from_msg(when))
+            if motion is not None or time.monotonic() > end:
+                return motion
+            if not 0.0 < stamp - frames.newest(odom, base) < _STOPPED:
+                return None  # it is not on its way
+            time.sleep(_PAUSE)
 
     def _stamp(self, message: Any) -> float:
         """Seconds of a message; of one without a time the node's own."""
