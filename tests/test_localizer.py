@@ -18,6 +18,7 @@ from anchorscan import (
     Record,
     Reference,
     ReferenceSetError,
+    SensorModel,
     Settings,
     SettingsError,
     drive,
@@ -26,6 +27,7 @@ from anchorscan import (
 from anchorscan.hypothesis import Hypothesis
 from anchorscan.localizer import Belief
 from anchorscan.protocol import CORRECT_HEADING, CORRECT_POSITION, choose_references
+from anchorscan.simulator import simulate
 
 BLIND = LaserScan(np.full(181, np.inf), -math.pi / 2, math.pi / 180)
 
@@ -243,6 +245,24 @@ def test_a_step_costs_at_most_one_search_and_a_bounded_number_of_places(
         assert len(belief.hypotheses) <= 5
     assert counting.most <= limits.belief.places + limits.verification.fits
     assert counting.searches < len(journey)
+
+
+def test_two_lasers_of_a_robot_at_rest_prove_no_more_than_one(
+    places: Matcher, journey: list[Record]
+) -> None:
+    """What one laser sees after the other is neither a way nor new: nothing is searched again."""
+    here, front, rear = journey[-1].pose, Pose2D(0.2), Pose2D(-0.4, 0.0, math.pi)
+    assert here is not None
+    counting = Counting(places)
+    localizer, rng = Localizer(counting), np.random.default_rng(1)
+    for number in range(8):
+        mounting = (front, rear)[number % 2]
+        scan = simulate(random_building(5), here @ mounting, SensorModel(noise=0.02), rng)
+        belief = localizer.update(scan, Pose2D(3.0) @ mounting, 0.1 * number, mounting)
+        assert belief.pose is not None
+        assert belief.pose.distance(here @ mounting) < 0.3
+        assert belief.pose.turn(here @ mounting) < 0.1
+    assert counting.searches == 1
 
 
 def test_a_robot_outside_of_the_map_searches_ever_less(places: Matcher) -> None:

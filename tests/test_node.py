@@ -102,7 +102,9 @@ class Sure:
     def __init__(self) -> None:
         self.fed: list[tuple[float, Pose2D | None]] = []
 
-    def update(self, scan: LaserScan, odometry: Pose2D | None, stamp: float) -> Belief:
+    def update(
+        self, scan: LaserScan, odometry: Pose2D | None, stamp: float, T_base_laser: Pose2D
+    ) -> Belief:
         self.fed.append((stamp, odometry))
         return Belief((hypothesis(Pose2D(5.0, 2.0, 0.5)),), 0.0, True)
 

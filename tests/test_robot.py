@@ -52,7 +52,9 @@ class Fixed:
         )
         self.belief = Belief(hypotheses, 1.0 - sum(probabilities), accepted)
 
-    def update(self, scan: LaserScan, odometry: Pose2D | None, stamp: float) -> Belief:
+    def update(
+        self, scan: LaserScan, odometry: Pose2D | None, stamp: float, T_base_laser: Pose2D
+    ) -> Belief:
         self.fed.append((odometry, stamp))
         return self.belief
 
@@ -288,6 +290,19 @@ def test_broken_odometry_ends_the_belief_but_not_the_announcement() -> None:
     assert tracker.resets == 1
     assert robot.is_announced
     assert [moved for moved, _ in tracker.fed] == [Pose2D(7.5), Pose2D(0.5)]
+
+
+def test_the_belief_is_told_which_laser_took_a_scan() -> None:
+    mountings = [Pose2D(0.2), Pose2D(-0.4, 0.0, math.pi)]
+    tracker = mock.MagicMock()
+    tracker.update.return_value = Fixed(0.9).belief
+    robot = Robot(tracker)
+    robot.odometry.add(10.0, Pose2D(7.0))
+    robot.odometry.add(10.2, Pose2D(7.0))
+    for number, mounting in enumerate(mountings):
+        robot.take(SCAN, 10.0 + 0.1 * number, mounting)
+        assert tracker.update.call_args.args[3] == mounting
+        assert tracker.update.call_args.args[1] == Pose2D(7.0) @ mounting
 
 
 # The mailbox

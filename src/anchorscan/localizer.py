@@ -156,7 +156,11 @@ class Localizer:
         return self._mixture
 
     def update(
-        self, scan: LaserScan, odometry: Pose2D | None = None, stamp: float | None = None
+        self,
+        scan: LaserScan,
+        odometry: Pose2D | None = None,
+        stamp: float | None = None,
+        T_base_laser: Pose2D = Pose2D(),
     ) -> Belief:
         """Take the next scan.
 
@@ -164,6 +168,8 @@ class Localizer:
             scan: In the frame of the laser.
             odometry: ``T_odom_laser`` when it was taken, where known.
             stamp: Seconds on any clock, where known; needed only where odometry is not.
+            T_base_laser: Where the laser sits; needed only where scans come from several lasers,
+                which see the same from a robot at rest.
 
         Returns:
             What is believed now.
@@ -172,7 +178,7 @@ class Localizer:
             ReferenceSetError: There are references, and no reference ever had a pose.
         """
         settings = self._settings
-        step = self._odometer.step(odometry, stamp)
+        step = self._odometer.step(odometry, stamp, T_base_laser)
         self._remember(scan, step)
         if not scan.is_return.any():
             self._mixture = moved(self._mixture, step, settings)

@@ -55,8 +55,10 @@ _TURN_JUMP, _TURN_SPEED = 1.0, 6.0
 class Tracker(Protocol):
     """A belief over time, as a `Localizer` is; poses are those of the laser, set's frame."""
 
-    def update(self, scan: LaserScan, odometry: Pose2D | None, stamp: float) -> Belief:
-        """Take a scan, ``T_odom_laser`` where known, and the time in seconds."""
+    def update(
+        self, scan: LaserScan, odometry: Pose2D | None, stamp: float, T_base_laser: Pose2D
+    ) -> Belief:
+        """Take a scan, ``T_odom_laser`` where known, the time in seconds, and the mounting."""
 
     def reset(self) -> None:
         """Know nothing."""
@@ -72,7 +74,9 @@ class SingleScans:
     def __init__(self, places: ReferenceSet) -> None:
         self._places = places
 
-    def update(self, scan: LaserScan, odometry: Pose2D | None, stamp: float) -> Belief:
+    def update(
+        self, scan: LaserScan, odometry: Pose2D | None, stamp: float, T_base_laser: Pose2D
+    ) -> Belief:
         """Locate the scan."""
         hypotheses = tuple(self._places.locate(scan))
         elsewhere = max(0.0, 1.0 - sum(each.probability for each in hypotheses))
@@ -219,10 +223,10 @@ class Robot:
             self._tracker.reset()
         T_odom_base = self.odometry.at(stamp)
         T_odom_laser = None if T_odom_base is None else T_odom_base @ T_base_laser
-        belief = self._tracker.update(scan, T_odom_laser, stamp)
+        belief = self._tracker.update(scan, T_odom_laser, stamp, T_base_laser)
         report = _report(belief, stamp, T_base_laser, T_odom_base)
         if self._mirror is not None:
-            self._mirror.add(scan, T_odom_laser)
+            self._mirror.add(scan, T_odom_base)
         is_withheld = report.state == "located" and bool(self.doubt)
         return replace(report, state="ambiguous") if is_withheld else report
 
