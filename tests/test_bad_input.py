@@ -379,7 +379,9 @@ class TestWrongMeaning:
                 return [replace(answer, score=1.0 if scan.angle_increment < 0.0 else 0.5)]
 
         class Sure:
-            def update(self, scan: LaserScan, odometry: Pose2D | None, stamp: float) -> Belief:
+            def update(
+                self, scan: LaserScan, odometry: Pose2D | None, stamp: float, T_base_laser: Pose2D
+            ) -> Belief:
                 return Belief((answer,), 0.01, True)
 
             def reset(self) -> None: ...

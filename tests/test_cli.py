@@ -176,6 +176,21 @@ def test_a_drive_is_tracked_from_nothing(
         assert Pose2D(0.0, 0.0, 2.0 * math.atan2(qz, qw)).turn(Pose2D(theta=line["theta"])) < 1e-6
 
 
+def test_what_a_robot_cannot_be_followed_in_is_refused_with_what_to_do(
+    run: Run, log: Path, places: Path, records: list[Record], tmp_path: Path
+) -> None:
+    done = run("track", places, log, "--preset", "paper")
+    assert (done.code, done.out) == (1, "")
+    assert "use those of the preset default" in done.err.splitlines()[-1]
+    with ReferenceSet(path=tmp_path / "poseless.apr") as poseless:
+        for record in records[:2]:
+            assert record.scan is not None
+            poseless.add(record.scan)
+    done = run("track", tmp_path / "poseless.apr", log)
+    assert (done.code, done.out) == (1, "")
+    assert "poseless.apr has no poses" in done.err.splitlines()[-1]
+
+
 def test_a_window_of_scans_tracks_as_well(
     run: Run, log: Path, places: Path, records: list[Record]
 ) -> None:

@@ -17,12 +17,17 @@ from anchorscan import (
     Pose2D,
     Record,
     Reference,
+    ReferenceSetError,
+    SensorModel,
+    Settings,
+    SettingsError,
     drive,
     random_building,
 )
 from anchorscan.hypothesis import Hypothesis
 from anchorscan.localizer import Belief
 from anchorscan.protocol import CORRECT_HEADING, CORRECT_POSITION, choose_references
+from anchorscan.simulator import simulate
 
 BLIND = LaserScan(np.full(181, np.inf), -math.pi / 2, math.pi / 180)
 
@@ -147,6 +152,45 @@ def test_an_empty_map_knows_nothing(journey: list[Record]) -> None:
     assert {(b.pose, b.accepted, b.elsewhere) for b in beliefs} == {(None, False, 1.0)}
 
 
+@pytest.mark.parametrize("poseless", [False, True], ids=["none left", "one without a pose left"])
+def test_when_all_references_go_nothing_is_known_until_others_come(
+    journey: list[Record], poseless: bool
+) -> None:
+    known = [Reference(r.index, r.scan, r.pose) for r in journey[:60:5] if r.scan is not None]
+    places = Matcher(known)
+    localizer = Localizer(places)
+    assert fed(localizer, journey[:10])[-1].pose is not None
+    if poseless:
+        places.add(Reference(-1, known[0].scan))
+    for reference in known:
+        places.remove(reference.identifier)
+    belief = fed(localizer, journey[10:11])[0]
+    assert (belief.state, belief.hypotheses, belief.elsewhere) == ("lost", (), 1.0)
+    assert localizer.update(BLIND).hypotheses == ()
+    assert not len(localizer.mixture)
+    for reference in known:
+        places.add(reference)
+    assert any(belief.accepted for belief in fed(localizer, journey[11:40]))
+
+
+def test_settings_that_make_no_map_are_refused_with_what_to_do() -> None:
+    places = Matcher((), Settings.preset("paper"))
+    with pytest.raises(SettingsError, match="use those of the preset default"):
+        Localizer(places)
+
+
+def test_references_without_poses_are_refused_with_what_to_do(journey: list[Record]) -> None:
+    places = Matcher()
+    localizer = Localizer(places)
+    assert fed(localizer, journey[:1])[0].state == "lost", "they may come later"
+    assert journey[0].scan is not None
+    places.add(Reference(0, journey[0].scan))
+    with pytest.raises(ReferenceSetError, match="TopologicalLocalizer"):
+        fed(localizer, journey[1:2])
+    places.add(Reference(1, journey[1].scan, journey[1].pose))  # type: ignore[arg-type]
+    assert fed(localizer, journey[2:3])[0].pose is not None
+
+
 @settings(max_examples=12)
 @given(data=st.data())
 def test_no_odometry_clock_or_scan_breaks_the_belief(
@@ -201,6 +245,24 @@ def test_a_step_costs_at_most_one_search_and_a_bounded_number_of_places(
         assert len(belief.hypotheses) <= 5
     assert counting.most <= limits.belief.places + limits.verification.fits
     assert counting.searches < len(journey)
+
+
+def test_two_lasers_of_a_robot_at_rest_prove_no_more_than_one(
+    places: Matcher, journey: list[Record]
+) -> None:
+    """What one laser sees after the other is neither a way nor new: nothing is searched again."""
+    here, front, rear = journey[-1].pose, Pose2D(0.2), Pose2D(-0.4, 0.0, math.pi)
+    assert here is not None
+    counting = Counting(places)
+    localizer, rng = Localizer(counting), np.random.default_rng(1)
+    for number in range(8):
+        mounting = (front, rear)[number % 2]
+        scan = simulate(random_building(5), here @ mounting, SensorModel(noise=0.02), rng)
+        belief = localizer.update(scan, Pose2D(3.0) @ mounting, 0.1 * number, mounting)
+        assert belief.pose is not None
+        assert belief.pose.distance(here @ mounting) < 0.3
+        assert belief.pose.turn(here @ mounting) < 0.1
+    assert counting.searches == 1
 
 
 def test_a_robot_outside_of_the_map_searches_ever_less(places: Matcher) -> None:

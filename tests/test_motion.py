@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from anchorscan import Pose2D
-from anchorscan.motion import MotionSettings, motion
+from anchorscan.motion import MotionSettings, Odometer, motion
 
 SETTINGS = MotionSettings()
 metres = st.floats(-3.0, 3.0)
@@ -73,3 +73,33 @@ def test_without_odometry_any_clock_gives_a_bounded_step(elapsed):
     assert 0.0 <= told.turned <= SETTINGS.turn_speed * SETTINGS.longest_interval
     assert np.isfinite(told.covariance).all()
     assert (np.diag(told.covariance) > 0.0).all()
+
+
+mountings = st.builds(Pose2D, st.floats(-1.0, 1.0), st.floats(-1.0, 1.0), headings)
+
+
+@given(base=poses, front=mountings, rear=mountings)
+def test_another_laser_of_a_robot_at_rest_is_no_motion_and_moves_the_pose(base, front, rear):
+    odometer = Odometer(SETTINGS)
+    odometer.step(base @ front, 0.0, front)
+    told = odometer.step(base @ rear, 0.1, rear)
+    assert told.measured
+    assert told.driven < 1e-9
+    assert told.turned < 1e-9
+    still = motion(Pose2D(), Pose2D(), 0.1, SETTINGS)
+    assert np.allclose(told.covariance, still.covariance)
+    assert (base @ front @ told.step).distance(base @ rear) < 1e-9
+    assert (base @ front @ told.step).turn(base @ rear) < 1e-9
+    # Nor is it one where odometry is silent.
+    told = odometer.step(None, 0.2, front)
+    assert not told.measured
+    assert (base @ rear @ told.step).distance(base @ front) < 1e-9
+
+
+@given(before=poses, now=poses)
+def test_a_laser_at_the_origin_moves_as_its_odometry_does_to_the_last_bit(before, now):
+    odometer = Odometer(SETTINGS)
+    odometer.step(before, 0.0)
+    told, plain = odometer.step(now, 0.1), motion(before, now, 0.1, SETTINGS)
+    assert (told.step, told.driven, told.turned) == (plain.step, plain.driven, plain.turned)
+    assert (told.covariance == plain.covariance).all()

@@ -52,7 +52,9 @@ class Fixed:
         )
         self.belief = Belief(hypotheses, 1.0 - sum(probabilities), accepted)
 
-    def update(self, scan: LaserScan, odometry: Pose2D | None, stamp: float) -> Belief:
+    def update(
+        self, scan: LaserScan, odometry: Pose2D | None, stamp: float, T_base_laser: Pose2D
+    ) -> Belief:
         self.fed.append((odometry, stamp))
         return self.belief
 
@@ -85,6 +87,28 @@ def test_odometry_far_from_every_message_is_not_known() -> None:
     assert odometry.at(10.2) == Pose2D(1.0)
     assert odometry.at(11.0) is None
     assert odometry.at(9.0) is None
+
+
+def test_between_messages_far_apart_odometry_is_not_known() -> None:
+    odometry = Odometry()
+    odometry.add(0.0, Pose2D())
+    odometry.add(9.9, Pose2D(9.0))
+    assert odometry.at(5.0) is None
+    assert odometry.at(0.2) == Pose2D()
+    assert odometry.at(9.8) == Pose2D(9.0)
+    assert odometry.at(9.9) == Pose2D(9.0)
+
+
+def test_a_heading_that_jumps_breaks_the_odometry_and_a_fast_turn_does_not() -> None:
+    odometry = Odometry()
+    odometry.add(0.0, Pose2D(0.2, 0.0, 3.0))
+    for k in range(1, 40):  # 4 rad/s, on through the other side
+        odometry.add(0.05 * k, Pose2D(0.2, 0.0, 3.0 + 0.2 * k))
+    assert odometry.breaks == 0
+    before = odometry.at(0.05 * 39)
+    assert before is not None
+    odometry.add(2.0, Pose2D(0.2, 0.0, before.theta + 3.0))
+    assert odometry.breaks == 1
 
 
 def test_wheels_that_begin_again_from_zero_break_the_odometry() -> None:
@@ -218,6 +242,43 @@ def test_a_clock_that_goes_back_starts_over() -> None:
     assert robot.take(SCAN, 3.0) is not None
 
 
+def test_a_clock_that_goes_back_while_no_scan_is_taken_starts_over() -> None:
+    """As an idle node sees it: it takes scans no more, and a recording begins again."""
+    tracker = Fixed(0.9)
+    robot = Robot(tracker)
+    robot.take(SCAN, 10.0)
+    robot.is_announced = True
+    robot.watch_clock(221.0)
+    robot.watch_clock(220.5)
+    assert robot.is_announced
+    robot.watch_clock(12.0)
+    assert not robot.is_announced
+    assert tracker.resets == 1
+
+
+def test_a_scan_that_waited_while_others_were_seen_is_taken() -> None:
+    tracker = Fixed(0.9)
+    robot = Robot(tracker)
+    for stamp in (10.0, 11.0, 12.0, 13.0):
+        robot.watch_clock(stamp)
+    assert all(robot.take(SCAN, stamp) is not None for stamp in (10.0, 11.0, 12.0, 13.0))
+    assert tracker.resets == 0
+
+
+@pytest.mark.parametrize("stamp", [-math.inf, math.inf, math.nan])
+def test_a_scan_at_no_time_is_left_out(stamp: float) -> None:
+    tracker = Fixed(0.9)
+    robot = Robot(tracker)
+    robot.take(SCAN, 10.0)
+    robot.is_announced = True
+    robot.watch_clock(stamp)
+    assert robot.take(SCAN, stamp) is None
+    assert robot.take(SCAN, 10.1) is not None
+    assert robot.is_announced
+    assert tracker.resets == 0
+    assert robot.late == 1
+
+
 def test_broken_odometry_ends_the_belief_but_not_the_announcement() -> None:
     tracker = Fixed(0.9)
     robot = Robot(tracker)
@@ -229,6 +290,19 @@ def test_broken_odometry_ends_the_belief_but_not_the_announcement() -> None:
     assert tracker.resets == 1
     assert robot.is_announced
     assert [moved for moved, _ in tracker.fed] == [Pose2D(7.5), Pose2D(0.5)]
+
+
+def test_the_belief_is_told_which_laser_took_a_scan() -> None:
+    mountings = [Pose2D(0.2), Pose2D(-0.4, 0.0, math.pi)]
+    tracker = mock.MagicMock()
+    tracker.update.return_value = Fixed(0.9).belief
+    robot = Robot(tracker)
+    robot.odometry.add(10.0, Pose2D(7.0))
+    robot.odometry.add(10.2, Pose2D(7.0))
+    for number, mounting in enumerate(mountings):
+        robot.take(SCAN, 10.0 + 0.1 * number, mounting)
+        assert tracker.update.call_args.args[3] == mounting
+        assert tracker.update.call_args.args[1] == Pose2D(7.0) @ mounting
 
 
 # The mailbox

@@ -36,6 +36,7 @@ from .belief import (
     weighed,
 )
 from .covariance import held
+from .errors import ReferenceSetError, SettingsError
 from .hypothesis import Hypothesis
 from .matcher import _ROOM, Candidates, Matcher, Trace
 from .motion import Motion, Odometer, new_share
@@ -117,12 +118,21 @@ class Localizer:
         places: A reference set or a matcher; references may come and go meanwhile.
         window: Metres of driving whose scans are joined for a search, where odometry is known;
             zero searches with single scans.
+
+    Raises:
+        SettingsError: The settings search references one by one, and so there is no map.
     """
 
     def __init__(self, places: Places, window: float = 0.0) -> None:
+        if places.settings.method != "map":
+            raise SettingsError(
+                "a robot is followed in the map of all references, and these settings (preset "
+                "paper) search them one by one: use those of the preset default or thorough"
+            )
         self._places = places
         self._window = window
         self._settings = places.settings.belief
+        self._knew_poses = False
         self.reset()
 
     def reset(self) -> None:
@@ -146,7 +156,11 @@ class Localizer:
         return self._mixture
 
     def update(
-        self, scan: LaserScan, odometry: Pose2D | None = None, stamp: float | None = None
+        self,
+        scan: LaserScan,
+        odometry: Pose2D | None = None,
+        stamp: float | None = None,
+        T_base_laser: Pose2D = Pose2D(),
     ) -> Belief:
         """Take the next scan.
 
@@ -154,12 +168,17 @@ class Localizer:
             scan: In the frame of the laser.
             odometry: ``T_odom_laser`` when it was taken, where known.
             stamp: Seconds on any clock, where known; needed only where odometry is not.
+            T_base_laser: Where the laser sits; needed only where scans come from several lasers,
+                which see the same from a robot at rest.
 
         Returns:
             What is believed now.
+
+        Raises:
+            ReferenceSetError: There are references, and no reference ever had a pose.
         """
         settings = self._settings
-        step = self._odometer.step(odometry, stamp)
+        step = self._odometer.step(odometry, stamp, T_base_laser)
         self._remember(scan, step)
         if not scan.is_return.any():
             self._mixture = moved(self._mixture, step, settings)
@@ -210,7 +229,14 @@ class Localizer:
         if self._recent and self._odometer.latest is not None:
             latest = Record(0, scan, odometry=self._odometer.latest)
             scan = joined_scan([*self._recent, latest], self._window)
-        in_map = self._places.explain(scan).in_map
+        trace = self._places.explain(scan)
+        in_map = trace.in_map
+        self._knew_poses |= in_map is not None
+        if trace.pairwise is not None and not self._knew_poses:
+            raise ReferenceSetError(
+                "a robot is followed by the poses of the references, and none of these has one: "
+                "use TopologicalLocalizer, which follows it from neighbour to neighbour"
+            )
         if in_map is None or not len(in_map.fits):
             return Found(np.empty((0, 3)))
         decision = in_map.decision
@@ -232,6 +258,11 @@ class Localizer:
         best = np.argsort(-right, kind="stable")
         order, right = order[best], right[best]
         references, T_reference_laser = self._places.nearest(mixture.poses[order])
+        if len(references) < len(
+            order
+        ):  # the last reference went: nothing is left to be anywhere in
+            self._mixture, self._belief = nothing_known(), Belief((), 1.0, False)
+            return self._belief
         accepted = (
             bool(len(order))
             and bool(right[0] >= settings.threshold)

@@ -232,7 +232,8 @@ class Matcher:
         """Name the reference that was taken nearest to each of (K, 3) poses ``T_set_laser``.
 
         Returns:
-            (K,) identifiers and (K, 3) ``T_reference_laser``.
+            (K,) identifiers and (K, 3) ``T_reference_laser``; none of either where no reference
+            has a pose.
         """
         return self._map.nearest(poses)
 

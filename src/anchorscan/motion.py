@@ -9,7 +9,7 @@ clocks jump; a step that no robot could have made is taken for no odometry at al
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -50,9 +50,9 @@ class Motion:
     """A step from one scan to the next.
 
     Args:
-        step: ``T_before_now`` of the laser.
+        step: ``T_before_now`` of the laser, or of the two lasers that took the scans.
         covariance: (3, 3) of x, y (metres) and theta (radians) of the step, frame of the laser.
-        driven: Metres; without odometry what is to be expected.
+        driven: Metres, by the robot's base; without odometry what is to be expected.
         turned: Radians; without odometry what is to be expected.
         measured: Whether odometry told.
     """
@@ -67,10 +67,10 @@ class Motion:
 def motion(
     before: Pose2D | None, now: Pose2D | None, elapsed: float | None, settings: MotionSettings
 ) -> Motion:
-    """Return the step between two scans.
+    """Return the step between two scans, of what odometry is told of: the base or the laser.
 
     Args:
-        before: ``T_odom_laser`` at the scan before, where known.
+        before: ``T_odom_base`` at the scan before, where known.
         now: The same at this scan.
         elapsed: Seconds between them where known; what is negative or not finite is not.
         settings: How far to trust it.
@@ -117,24 +117,38 @@ def new_share(driven: float, turned: float, alike: Alike) -> float:
 class Odometer:
     """Tells of every scan how the robot moved since the one before.
 
+    How far it drove and turned, and how sure that is, are those of its base: a scan that another
+    laser of the same robot took is no motion, however far that one is from the first.
+
     Args:
         settings: How far to trust odometry.
+
+    Attributes:
+        latest: ``T_odom_laser`` of the latest scan, where known.
     """
 
     def __init__(self, settings: MotionSettings) -> None:
         self._settings = settings
         self.latest: Pose2D | None = None
+        self._base: Pose2D | None = None
+        self._T_base_laser: Pose2D | None = None
         self._stamp: float | None = None
 
-    def step(self, odometry: Pose2D | None, stamp: float | None) -> Motion:
+    def step(
+        self, odometry: Pose2D | None, stamp: float | None, T_base_laser: Pose2D = Pose2D()
+    ) -> Motion:
         """Return the step to the next scan; what is not finite is taken for unknown.
 
         Args:
             odometry: ``T_odom_laser``, where known.
             stamp: Seconds on any clock, where known.
+            T_base_laser: Where the laser that took the scan sits.
         """
         elapsed = None if stamp is None or self._stamp is None else stamp - self._stamp
-        step = motion(self.latest, odometry, elapsed, self._settings)
+        base = None if odometry is None else odometry @ T_base_laser.inverse()
+        of_base = motion(self._base, base, elapsed, self._settings)
+        before = T_base_laser if self._T_base_laser is None else self._T_base_laser
         self.latest = odometry if odometry is None or odometry.is_finite() else None
+        self._base, self._T_base_laser = base, T_base_laser
         self._stamp = stamp if stamp is None or math.isfinite(stamp) else None
-        return step
+        return replace(of_base, step=before.inverse() @ of_base.step @ T_base_laser)

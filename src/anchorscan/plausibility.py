@@ -225,11 +225,11 @@ class MirrorWatch:
         self._last: Pose2D | None = None
         self._unasked = _EVERY
 
-    def add(self, scan: LaserScan, T_odom_laser: Pose2D | None = None) -> None:
-        """Look at the next scan."""
-        if self._is_done or not self._is_elsewhere(T_odom_laser):
+    def add(self, scan: LaserScan, odometry: Pose2D | None = None) -> None:
+        """Look at the next scan; odometry is of the base, or always of the same laser."""
+        if self._is_done or not self._is_elsewhere(odometry):
             return
-        self._last, self._unasked = T_odom_laser, 0
+        self._last, self._unasked = odometry, 0
         self.found = self.found.with_scan(self._places, scan)
 
     @property
@@ -243,10 +243,10 @@ class MirrorWatch:
     def _is_done(self) -> bool:
         return self.found.as_given + self.found.mirrored >= _ASKED
 
-    def _is_elsewhere(self, T_odom_laser: Pose2D | None) -> bool:
+    def _is_elsewhere(self, odometry: Pose2D | None) -> bool:
         """Tell whether the scan says something that the one asked last does not."""
-        if T_odom_laser is not None and self._last is not None:
-            return self._last.distance(T_odom_laser) >= _ELSEWHERE
+        if odometry is not None and self._last is not None:
+            return self._last.distance(odometry) >= _ELSEWHERE
         self._unasked += 1
         return self._unasked >= _EVERY
 

@@ -43,18 +43,22 @@ _CLOCK_JUMP = 1.0
 # Odometry is kept for this long, and held to be true for so long before and after, seconds.
 _MEMORY = 10.0
 _REACH = 0.25
-# Odometry this much older than a scan has stopped, seconds.
+# Odometry this much older than a scan has stopped, and what was between two messages farther
+# apart is not known, seconds.
 _LATE = 1.0
 # Farther than this and faster than this no robot drives between two messages, metres, and a
-# second.
+# second; nor does it turn more than this, radians, and a second.
 _JUMP, _SPEED = 0.5, 5.0
+_TURN_JUMP, _TURN_SPEED = 1.0, 6.0
 
 
 class Tracker(Protocol):
     """A belief over time, as a `Localizer` is; poses are those of the laser, set's frame."""
 
-    def update(self, scan: LaserScan, odometry: Pose2D | None, stamp: float) -> Belief:
-        """Take a scan, ``T_odom_laser`` where known, and the time in seconds."""
+    def update(
+        self, scan: LaserScan, odometry: Pose2D | None, stamp: float, T_base_laser: Pose2D
+    ) -> Belief:
+        """Take a scan, ``T_odom_laser`` where known, the time in seconds, and the mounting."""
 
     def reset(self) -> None:
         """Know nothing."""
@@ -70,7 +74,9 @@ class SingleScans:
     def __init__(self, places: ReferenceSet) -> None:
         self._places = places
 
-    def update(self, scan: LaserScan, odometry: Pose2D | None, stamp: float) -> Belief:
+    def update(
+        self, scan: LaserScan, odometry: Pose2D | None, stamp: float, T_base_laser: Pose2D
+    ) -> Belief:
         """Locate the scan."""
         hypotheses = tuple(self._places.locate(scan))
         elsewhere = max(0.0, 1.0 - sum(each.probability for each in hypotheses))
@@ -122,6 +128,7 @@ class Odometry:
                 last, before = self._samples[-1]
                 passed = stamp - last
                 jumped = before.distance(T_odom_base) > _JUMP + _SPEED * abs(passed)
+                jumped |= before.turn(T_odom_base) > _TURN_JUMP + _TURN_SPEED * abs(passed)
                 if -_CLOCK_JUMP < passed <= 0.0 and not jumped:
                     return
                 if passed <= -_CLOCK_JUMP or jumped:
@@ -149,10 +156,12 @@ class Odometry:
         with self._lock:
             samples = tuple(self._samples)
         after = next((k for k, sample in enumerate(samples) if sample[0] >= stamp), len(samples))
-        if 0 < after < len(samples):
-            return _between(samples[after - 1], samples[after], stamp)
-        nearest = samples[min(after, len(samples) - 1)] if samples else (math.inf, Pose2D())
-        return nearest[1] if abs(nearest[0] - stamp) <= _REACH else None
+        beside = samples[max(after - 1, 0) : after + 1]
+        if len(beside) == 2 and beside[1][0] - beside[0][0] <= _LATE:
+            return _between(beside[0], beside[1], stamp)
+        nearest = min(beside, key=lambda sample: abs(sample[0] - stamp), default=None)
+        is_near = nearest is not None and abs(nearest[0] - stamp) <= _REACH
+        return nearest[1] if nearest is not None and is_near else None
 
     def clear(self) -> None:
         """Forget everything."""
@@ -187,7 +196,7 @@ class Robot:
         self._mirror = mirror
         self.odometry = odometry or Odometry()
         self._breaks = self.odometry.breaks
-        self._last = -math.inf
+        self._last = self._newest = -math.inf  # stamps: of scans taken, and of scans seen
         self.is_announced = False
         self.late = 0
 
@@ -202,20 +211,22 @@ class Robot:
         Returns:
             None for a scan that came too late or twice, or at no time.
         """
-        self.watch_clock(stamp)
-        if not self._last < stamp < math.inf:
+        # Not by the newest seen: a scan may have waited while others were seen.
+        if math.isfinite(stamp) and stamp <= self._last - _CLOCK_JUMP:
+            self.start_over()
+        if not (math.isfinite(stamp) and self._last < stamp):
             self.late += 1
             return None
-        self._last = stamp
+        self._last, self._newest = stamp, max(self._newest, stamp)
         if self.odometry.breaks != self._breaks:
             self._breaks = self.odometry.breaks
             self._tracker.reset()
         T_odom_base = self.odometry.at(stamp)
         T_odom_laser = None if T_odom_base is None else T_odom_base @ T_base_laser
-        belief = self._tracker.update(scan, T_odom_laser, stamp)
+        belief = self._tracker.update(scan, T_odom_laser, stamp, T_base_laser)
         report = _report(belief, stamp, T_base_laser, T_odom_base)
         if self._mirror is not None:
-            self._mirror.add(scan, T_odom_laser)
+            self._mirror.add(scan, T_odom_base)
         is_withheld = report.state == "located" and bool(self.doubt)
         return replace(report, state="ambiguous") if is_withheld else report
 
@@ -228,15 +239,18 @@ class Robot:
 
     def watch_clock(self, stamp: float) -> None:
         """Start over when the time of a scan, taken or not, shows that the clock went back."""
-        if stamp <= self._last - _CLOCK_JUMP:
+        if not math.isfinite(stamp):
+            return
+        if stamp <= self._newest - _CLOCK_JUMP:
             self.start_over()
+        self._newest = max(self._newest, stamp)
 
     def start_over(self) -> None:
         """Forget where the robot is, and that anybody was told."""
         self._tracker.reset()
         if self._mirror is not None:
             self._mirror.reset()
-        self._last = -math.inf
+        self._last = self._newest = -math.inf
         self.is_announced = False
 
 

@@ -18,7 +18,7 @@ import sys
 import threading
 import time
 import traceback
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -78,8 +78,12 @@ __all__ = ["LocalizationNode", "main"]
 # A laser that tilts more than this does not see the walls of a plan, radians.
 _LEVEL = math.radians(10.0)
 _ODOMETRY_DEPTH = 100
-# So long a scan waits for odometry that is on its way, seconds.
-_PATIENCE = 0.1
+# So long a scan waits for odometry that is on its way, seconds, and so often it looks for it.
+_PATIENCE, _PAUSE = 0.1, 0.01
+# Odometry this much older than now or than a scan has stopped, seconds.
+_STOPPED = 1.0
+# A report of a scan this much older than the newest one is not where the robot is now, seconds.
+_FRESH = 1.0
 _NANO = 1e-9
 _NAMED_HYPOTHESES = 3
 
@@ -103,14 +107,24 @@ class _Frames:
 
     def motion(self, target: str, source: str, when: Any = None) -> NDArray[np.float64] | None:
         """Return the (4, 4) ``T_target_source`` at a time (the latest if None), if known."""
-        if self._buffer is None:
-            return None
-        try:
-            found = self._buffer.lookup_transform(target, source, when or Time())
-        except tf2_ros.TransformException:
+        found = self._found(target, source, when)
+        if found is None:
             return None
         place, turn = found.transform.translation, found.transform.rotation
         return matrix_of(np.array([place.x, place.y, place.z, turn.x, turn.y, turn.z, turn.w]))
+
+    def newest(self, target: str, source: str) -> float:
+        """Return the time of the latest motion, seconds; minus infinity if none is known."""
+        found = self._found(target, source, None)
+        return -math.inf if found is None else _seconds(found.header.stamp)
+
+    def _found(self, target: str, source: str, when: Any) -> Any:
+        if self._buffer is None:
+            return None
+        try:
+            return self._buffer.lookup_transform(target, source, when or Time())
+        except tf2_ros.TransformException:
+            return None
 
     def broadcast(self, transform: Any) -> None:
         if self._broadcaster is not None:
@@ -130,6 +144,8 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
         options: Passed on to the node.
     """
 
+    _newest: Any  # message of a scan
+
     def __init__(self, *, autostart: bool = False, **options: Any) -> None:
         super().__init__("anchorscan", **options)
         for name, (default, meaning) in RobotParameters.meanings().items():
@@ -143,6 +159,7 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
         self._worker: threading.Thread | None = None
         self._is_active = False
         self._lock = threading.Lock()  # of robot, report and places
+        self._complaining = threading.Lock()  # of changes to complaints
         self._forget()
 
     # Transitions
@@ -161,8 +178,9 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
                     raise SettingsError(f"{options.set_file} has no poses in a common frame")
             else:
                 places = ReferenceSet(settings=settings)
+            localizer = Localizer(places)  # refuses settings that make no map
             places.prepare()
-            Localizer(places).prepare()
+            localizer.prepare()
             if options.set_file:
                 self._adopt(places)
         except AnchorscanError as error:
@@ -182,6 +200,7 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
         with self._lock:
             self._start_over()
         self._is_active = True
+        self._newest = None  # heard before, and the robot may have been carried away meanwhile
         self._activated = self._heard = time.monotonic()
         return result
 
@@ -217,15 +236,17 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
         self._places: ReferenceSet | None = None
         self._robot: Robot | None = None
         self._report: Report | None = None
+        self._report_stamp: Any = None  # of the report, as the message of its scan gave it
         self._frames: _Frames | None = None
         self._map_digest = b""
         self._laser_frame = ""
-        self._newest: Any = None
-        self._activated = self._heard = -math.inf
+        self._newest = None
+        self._activated = self._heard = self._odometry_heard = -math.inf
         self._seconds = math.nan
         self._counts = {"scans": 0, "located": 0, "unusable": 0}
-        # What is wrong with a topic, by its name; mended by the next good message.
-        self._complaints: dict[str, str] = {}
+        # What is wrong with a topic, by its name; mended by the next good message.  Never changed
+        # but replaced: one thread changes what another goes through.
+        self._complaints: Mapping[str, str] = {}
 
     def _read_parameters(self) -> RobotParameters:
         values: dict[str, Any] = {}
@@ -327,6 +348,7 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
             self._complain("odometry", "holds no pose")
             return
         self._mend("odometry")
+        self._odometry_heard = time.monotonic()
         robot.odometry.add(_seconds(message.header.stamp), T_odom_base)
 
     def _take_map(self, message: Any) -> None:
@@ -352,17 +374,19 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
         except ScanError as error:
             return False, f"the newest scan is unusable: {error}"
         with self._lock:
-            robot, last = self._robot, self._report
+            robot, last, last_stamp = self._robot, self._report, self._report_stamp
             doubt = "" if robot is None else robot.doubt
         if doubt:
             return False, f"the laser {doubt}"
-        odometry = None if robot is None else robot.odometry
+        odometry, stamp = None if robot is None else robot.odometry, message.header.stamp
         report = Robot(SingleScans(places), odometry).take(scan, self._stamp(message), T_base_laser)
         assert report is not None
-        if report.state != "located" and last is not None and last.state == "located":
-            report = last
+        # An idle node takes no scans: then the last report is of a place left long ago.
+        is_fresh = last is not None and abs(report.stamp - last.stamp) <= _FRESH
+        if report.state != "located" and last is not None and last.state == "located" and is_fresh:
+            report, stamp = last, last_stamp
         if report.state == "located":
-            self._announce(report, message.header.stamp)
+            self._announce(robot, report, stamp)
         return report.state == "located", _in_words(report)
 
     def _start_over_now(self, request: Any, response: Any) -> Any:
@@ -447,18 +471,17 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
             return
         self._mend("scan")
         if (waiting := self._robot) is not None:
-            waiting.odometry.wait_until(self._stamp(message), _PATIENCE)
+            self._await_odometry(waiting, message)
         begin = time.perf_counter()
         with self._lock:
             robot = self._robot
             if robot is None:
                 return
-            self._odometry_from_tf(robot, message)
             report = robot.take(scan, self._stamp(message), T_base_laser)
             self._seconds = time.perf_counter() - begin
             if report is None:
                 return
-            self._report = report
+            self._report, self._report_stamp = report, message.header.stamp
             doubt = robot.doubt
         if doubt:
             self._complain("laser", f"{doubt}; see /tf, or laser_is_upside_down")
@@ -507,15 +530,35 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
             )
         return Pose2D(*options.laser_pose), options.laser_is_upside_down
 
-    def _odometry_from_tf(self, robot: Robot, message: Any) -> None:
-        """Let tf2 tell the odometry where no topic does."""
-        options, stamp = self._options, self._stamp(message)
-        if self._frames is None or options is None or robot.odometry.at(stamp) is not None:
+    def _await_odometry(self, robot: Robot, message: Any) -> None:
+        """Have odometry come as far as a scan: by its topic or, where that is silent, by tf2.
+
+        Never by both: what filters tell tf2 drifts otherwise than the wheels do.
+        """
+        stamp = self._stamp(message)
+        if time.monotonic() - self._odometry_heard < _STOPPED:
+            robot.odometry.wait_until(stamp, _PATIENCE)
             return
-        when = Time.from_msg(message.header.stamp)
-        motion = self._frames.motion(options.odom_frame_id, options.base_frame_id, when)
+        motion = self._motion_from_tf(message.header.stamp, stamp)
         if motion is not None:
             robot.odometry.add(stamp, planar(motion))
+        elif self._odometry_heard > -math.inf:  # the topic was silent, and may go on just now
+            robot.odometry.wait_until(stamp, _PATIENCE)
+
+    def _motion_from_tf(self, when: Any, stamp: float) -> NDArray[np.float64] | None:
+        """Return the (4, 4) ``T_odom_base`` at the time of a scan, if tf2 comes to know it."""
+        options, frames = self._options, self._frames
+        if frames is None or options is None:
+            return None
+        odom, base = options.odom_frame_id, options.base_frame_id
+        end = time.monotonic() + _PATIENCE
+        while True:
+            motion = frames.motion(odom, base, Time.from_msg(when))
+            if motion is not None or time.monotonic() > end:
+                return motion
+            if not 0.0 < stamp - frames.newest(odom, base) < _STOPPED:
+                return None  # it is not on its way
+            time.sleep(_PAUSE)
 
     def _stamp(self, message: Any) -> float:
         """Seconds of a message; of one without a time the node's own."""
@@ -537,17 +580,18 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
             return
         self._counts["located"] += 1
         if not robot.is_announced and self._initial_pose.get_subscription_count():
-            self._announce(report, stamp)
-            robot.is_announced = True
+            self._announce(robot, report, stamp)
         if options.continuous:
             self._pose.publish(_pose_with_covariance(report, options.global_frame_id, stamp))
             self._broadcast(report, stamp, options)
 
-    def _announce(self, report: Report, stamp: Any) -> None:
+    def _announce(self, robot: Robot | None, report: Report, stamp: Any) -> None:
         options = self._options
         if options is None:
             return
         self._initial_pose.publish(_pose_with_covariance(report, options.global_frame_id, stamp))
+        if robot is not None and self._initial_pose.get_subscription_count():
+            robot.is_announced = True
         self.get_logger().info(f"told {options.initial_pose_topic}: {_in_words(report)}")
 
     def _broadcast(self, report: Report, stamp: Any, options: RobotParameters) -> None:
@@ -566,25 +610,34 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
 
     def _complain(self, topic: str, reason: str) -> None:
         """Say what is wrong with a topic: in the log when it is new, else in diagnostics."""
-        if self._complaints.get(topic) != reason:
-            self._complaints[topic] = reason
+        with self._complaining:
+            is_new = self._complaints.get(topic) != reason
+            self._complaints = {**self._complaints, topic: reason}
+        if is_new:
             self.get_logger().warning(f"{topic}: {reason}")
 
     def _mend(self, topic: str) -> None:
-        if self._complaints.pop(topic, None) is not None:
+        with self._complaining:
+            is_mended = topic in self._complaints
+            if is_mended:
+                left = {each: why for each, why in self._complaints.items() if each != topic}
+                self._complaints = left
+        if is_mended:
             self.get_logger().info(f"{topic}: all right again")
 
     def _reason(self, topic: str) -> str:
-        return f": the {topic} {self._complaints[topic]}" if topic in self._complaints else ""
+        reason = self._complaints.get(topic)
+        return "" if reason is None else f": the {topic} {reason}"
 
     def _diagnose(self) -> None:
         options, mailbox = self._options, self._mailbox
         if options is None or mailbox is None:
             return
+        complaints = self._complaints
         status = DiagnosticStatus()
         status.name = f"{self.get_name()}: localization"
         status.hardware_id = options.base_frame_id
-        status.level, status.message = next(self._summary(options))
+        status.level, status.message = next(self._summary(options, complaints))
         values: dict[str, Any] = {
             "references": 0 if self._places is None else len(self._places),
             **{f"scans {what}": count for what, count in self._counts.items()},
@@ -592,7 +645,7 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
             "scans late": 0 if self._robot is None else self._robot.late,
             "told": self._robot is not None and self._robot.is_announced,
             "query milliseconds": f"{1e3 * self._seconds:.2f}",
-            **{f"problem: {topic}": reason for topic, reason in self._complaints.items()},
+            **{f"problem: {topic}": reason for topic, reason in complaints.items()},
         }
         report = self._report
         if report is not None:
@@ -607,26 +660,28 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
         array.status = [status]
         self._diagnostics.publish(array)
 
-    def _summary(self, options: RobotParameters) -> Iterator[tuple[bytes, str]]:
+    def _summary(
+        self, options: RobotParameters, complaints: Mapping[str, str]
+    ) -> Iterator[tuple[bytes, str]]:
         """Yield levels and messages; the first is what keeps the robot from being located."""
         ok, warning, error = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
         if not self._is_active:
             yield ok, "inactive"
-        if "node" in self._complaints:
-            yield error, f"the node {self._complaints['node']}"
-        if self._places is None and "map" in self._complaints:
-            yield error, f"no map{self._reason('map')}"
+        if "node" in complaints:
+            yield error, f"the node {complaints['node']}"
+        if self._places is None and "map" in complaints:
+            yield error, f"no map: the map {complaints['map']}"
         if self._places is None:
             yield warning, f"waiting for a map on {options.map_topic}"
         silence = time.monotonic() - self._heard
         if silence > options.scan_timeout:
             yield error, f"no scan on {options.scan_topic} for {silence:.0f} s"
-        if "scan" in self._complaints:
-            yield warning, f"the scan {self._complaints['scan']}"
-        if "laser" in self._complaints:
-            yield error, f"the laser {self._complaints['laser']}"
-        if "map" in self._complaints:
-            yield warning, f"the map {self._complaints['map']}; the old one is used"
+        if "scan" in complaints:
+            yield warning, f"the scan {complaints['scan']}"
+        if "laser" in complaints:
+            yield error, f"the laser {complaints['laser']}"
+        if "map" in complaints:
+            yield warning, f"the map {complaints['map']}; the old one is used"
         if self._robot is not None and self._robot.is_announced and not options.continuous:
             yield ok, "located and told; idle until asked"
         report = self._report

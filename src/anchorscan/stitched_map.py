@@ -334,10 +334,13 @@ class StitchedMap:
         """Return the identifier of the reference taken nearest to each of (K, 3) poses.
 
         Returns:
-            (K,) identifiers and (K, 3) ``T_reference_laser``.
+            (K,) identifiers and (K, 3) ``T_reference_laser``; none of either where there is no
+            reference at all.
         """
         lots = self._content.lots
         numbers, places, T_reference_scan = nearest(lots, poses)
+        if (numbers < 0).any():
+            return np.empty(0, np.int64), np.empty((0, 3))
         identifiers = [
             lots[n].identifiers[k] for n, k in zip(numbers.tolist(), places.tolist(), strict=True)
         ]

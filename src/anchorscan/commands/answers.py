@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from ..errors import LogError
+from ..errors import LogError, ReferenceSetError
 from .console import say, write_lines
 from .logs import records_shown, refuse_mirrored
 from .options import (
@@ -286,9 +286,14 @@ def _tracked(
     from ..reference_set import ReferenceSet
 
     places = ReferenceSet.open(set_file, settings=settings)
+    localizer = Localizer(places, window)
+    if not places.has_poses and all(each.pose is None for each in places.references):
+        raise ReferenceSetError(
+            f"{set_file} has no poses in a common frame, and a robot is followed by them: use "
+            "locate, or in Python TopologicalLocalizer"
+        )
     places.prepare()
     refuse_mirrored(places, log)
-    localizer = Localizer(places, window)
     localizer.prepare()
     for record in records:
         line: dict[str, Any] = {"scan": record.index, "stamp": record.stamp}
