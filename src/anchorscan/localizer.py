@@ -258,9 +258,8 @@ class Localizer:
         best = np.argsort(-right, kind="stable")
         order, right = order[best], right[best]
         references, T_reference_laser = self._places.nearest(mixture.poses[order])
-        if len(references) < len(
-            order
-        ):  # the last reference went: nothing is left to be anywhere in
+        if len(references) < len(order):
+            # The last reference went: nothing is left to be anywhere in.
             self._mixture, self._belief = nothing_known(), Belief((), 1.0, False)
             return self._belief
         accepted = (
