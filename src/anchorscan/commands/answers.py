@@ -301,7 +301,8 @@ def _tracked(
             yield {**line, "seconds": 0.0, "accepted": False, "reason": record.problem}
             continue
         start = time.perf_counter()
-        belief = localizer.update(record.scan, record.odometry, record.stamp)
+        mounting = record.T_base_laser or Pose2D()
+        belief = localizer.update(record.scan, record.odometry, record.stamp, mounting)
         line["seconds"] = round(time.perf_counter() - start, _DECIMALS + 1)
         line["accepted"] = bool(belief.accepted)
         line |= _pose_line(belief.pose)
