@@ -565,6 +565,43 @@ def test_a_full_disk_is_one_clear_line(log: Path, places: Path, way: str) -> Non
     assert_one_line_error(Outcome(done.returncode, "", done.stderr), "No space left")
 
 
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("locate", "SET", "LOG", "-o", "LOG"),
+        ("locate", "SET", "LOG", "-o", "SET"),
+        ("locate", "SET", "LOG", "-o", "LINK"),
+        ("locate", "SET", "LOG", "--settings", "FILE", "-o", "FILE"),
+        ("which", "SET", "LOG", "-o", "LOG"),
+        ("which", "FOLDER", "LOG", "-o", "SET"),
+        ("track", "SET", "LOG", "-o", "LOG"),
+        ("track", "SET", "LOG", "--tum", "SET"),
+        ("track", "SET", "LOG", "-o", "NEW", "--tum", "NEW"),
+        ("build", "LOG", "-o", "LOG"),
+        ("build", "LOG", "--poses", "FILE", "-o", "FILE"),
+        ("report", "FILE", "-o", "FILE"),
+        ("report", "FILE", "--set", "SET", "-o", "SET"),
+        ("report", "FILE", "--log", "LOG", "-o", "LOG"),
+        ("view", "SET", "LOG", "-o", "SET"),
+    ],
+    ids=" ".join,
+)
+def test_no_command_writes_over_what_it_reads(
+    run: Run, log: Path, places: Path, tmp_path: Path, words: tuple[str, ...]
+) -> None:
+    names = {"SET": "sets/a.apr", "LOG": "a.log", "LINK": "b.log", "FILE": "f", "NEW": "new"}
+    files = {word: tmp_path / name for word, name in names.items()} | {"FOLDER": tmp_path / "sets"}
+    files["FOLDER"].mkdir()
+    files["SET"].write_bytes(places.read_bytes())
+    files["LOG"].write_bytes(log.read_bytes())
+    files["LINK"].symlink_to(files["LOG"])
+    files["FILE"].write_text("{}")
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+    said = [files.get(word, word) for word in words]
+    assert_one_line_error(run(*said), said[-1], "name another")
+    assert before == {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+
+
 # Commands that make no sense: exit code 2, nothing done
 
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from ..errors import AnchorscanError
-from .console import progress, say
+from .console import progress, refuse_overwriting, say
 from .logs import problems, records_of, refuse_another_frame, refuse_mirrored, stem
 from .options import LaserOption, LogOptions, SetArgument, SettingsOptions, SharingOptions
 
@@ -109,6 +109,7 @@ def build(
 
     Of several logs, one that cannot be read is named and left out.
     """
+    refuse_overwriting([output], [*logs, posing.poses, settings.settings_file])
     chosen = settings.read()
     is_map = any(map(_is_map, logs))
     said = reading.topic or reading.upside_down or posing.poses or posing.laser

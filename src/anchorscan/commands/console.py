@@ -18,7 +18,7 @@ import typer
 
 from ..errors import AnchorscanError, LogError
 
-__all__ = ["FAILED", "guarded", "progress", "say", "write_lines"]
+__all__ = ["FAILED", "guarded", "progress", "refuse_overwriting", "say", "write_lines"]
 
 Command = TypeVar("Command", bound=Callable[..., None])
 Item = TypeVar("Item")
@@ -26,6 +26,8 @@ Item = TypeVar("Item")
 FAILED = 1
 _PROGRESS_DELAY = 1.0
 _PROGRESS_INTERVAL = 0.1
+# What a folder that is read is made of: sets, and the parts of a recording.
+_PARTS = (".apr", ".db3", ".mcap", ".yaml")
 
 
 def guarded(command: Command) -> Command:
@@ -83,6 +85,41 @@ def _tell_of_compiling() -> None:
     log.setLevel(logging.INFO)
     log.handlers = [_Saying()]
     log.propagate = False
+
+
+def refuse_overwriting(outputs: Iterable[Path | None], inputs: Iterable[Path | str | None]) -> None:
+    """End before anything is done where a file would be written that is read, or written, too.
+
+    Args:
+        outputs: Files to write; those that nobody asked for are None.
+        inputs: Files and folders to read; names of nothing are no files.
+
+    Raises:
+        AnchorscanError: It would.
+    """
+    written: list[Path] = []
+    read = [Path(path) for path in inputs if path is not None]
+    for path in (path for path in outputs if path is not None):
+        if path.exists() and not path.resolve().is_file():
+            continue  # a pipe or a device loses nothing, and of a folder others complain
+        if any(_is_same(path, other) or _is_part(path, other) for other in read):
+            raise AnchorscanError(f"{path}: is read here, and would be overwritten; name another")
+        if any(_is_same(path, other) for other in written):
+            raise AnchorscanError(f"{path}: would be written twice; name another")
+        written.append(path)
+
+
+def _is_same(a: Path, b: Path) -> bool:
+    """Tell whether two names are of one file, which need not be there."""
+    try:
+        return a.samefile(b)
+    except OSError:
+        return a.resolve() == b.resolve()
+
+
+def _is_part(path: Path, folder: Path) -> bool:
+    """Tell whether a file is what a folder is read for."""
+    return path.suffix in _PARTS and folder.is_dir() and _is_same(path.parent, folder)
 
 
 def write_lines(lines: Iterable[dict[str, Any]], path: Path | None) -> Iterator[dict[str, Any]]:
