@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 import io
+import os
 import zipfile
 from pathlib import Path
 
@@ -124,3 +125,14 @@ def test_any_bytes_give_a_clear_line_or_sound_records(
         path = tmp_path_factory.mktemp("bytes") / "log"
         path.write_bytes(magic + content)
         check(path)
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="there are no named pipes here")
+def test_a_pipe_is_refused_before_it_is_read(tmp_path: Path) -> None:
+    pipe, log = tmp_path / "pipe", tmp_path / "a.log"
+    os.mkfifo(pipe)
+    log.write_bytes(carmen())
+    with pytest.raises(LogError, match=r"pipe: is no file, .*: write it to a file first"):
+        open_log(pipe)
+    with pytest.raises(LogError, match=r"pipe: is no file, .*: write it to a file first"):
+        open_log(log, poses=pipe)

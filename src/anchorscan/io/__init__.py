@@ -7,6 +7,7 @@
 from __future__ import annotations
 
 import math
+import stat
 from pathlib import Path
 
 from ..errors import LogError
@@ -153,6 +154,9 @@ def _magic(path: Path) -> bytes:
     try:
         if path.is_dir():
             return b""
+        if not stat.S_ISREG(path.stat().st_mode):
+            # It is read more than once, and a pipe would give every reader another part.
+            raise LogError("is no file, but a pipe or a device: write it to a file first", path)
         with path.open("rb") as stream:
             magic = stream.read(_MAGIC_LENGTH)
     except FileNotFoundError:
@@ -168,8 +172,13 @@ def _magic(path: Path) -> bytes:
 
 def _tum_file(poses: str | Path | None, log: Path) -> TextFile | None:
     """Return the file that ``poses`` names, or None where it names a topic or nothing."""
-    if poses is None or not Path(poses).is_file():
+    if poses is None:
         return None
+    try:
+        if not Path(poses).exists() or Path(poses).is_dir():
+            return None
+    except OSError as error:
+        raise LogError(f"cannot be read: {error.strerror}", poses) from None
     if Path(poses).absolute() == log.absolute():
         raise LogError("is the log itself, not a trajectory", poses)
     return find_text(Path(poses), _magic(Path(poses)))
