@@ -88,7 +88,11 @@ def open_log(
     path = Path(path)
     _check(field_of_view, range_max)
     magic = _magic(path)
-    if found := find_bag(path, magic):
+    try:
+        found = find_bag(path, magic)
+    except OSError as error:
+        raise LogError(f"cannot be read: {error.strerror}", path) from None
+    if found:
         tum = _tum_file(poses, path)
         options = BagOptions(
             topic=topic,

@@ -124,7 +124,10 @@ def find_bag(path: Path, magic: bytes) -> tuple[str, list[Path]] | None:
 def _whole(path: Path) -> Path:
     """Return the folder of a storage file that is all of a recording: it tells of compression."""
     folder = path.absolute().parent
-    storages = [part for part in folder.iterdir() if part.suffix in _STORAGE_MAGICS]
+    try:
+        storages = [part for part in folder.iterdir() if part.suffix in _STORAGE_MAGICS]
+    except OSError:  # a folder that may not be listed
+        return path
     return folder if (folder / "metadata.yaml").is_file() and len(storages) == 1 else path
 
 
