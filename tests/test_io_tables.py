@@ -219,6 +219,21 @@ def test_a_cell_that_is_no_number_is_the_one_that_is_named(tmp_path: Path) -> No
     assert [record.problem for record in log] == reasons
 
 
+def test_a_mounting_that_would_change_nothing_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text("x,y,theta," + ",".join(f"r{i}" for i in range(181)))
+    with (tmp_path / "a.csv").open("a") as stream:
+        stream.write("\n" + ",".join(["1.0"] * 184))
+    np.save(tmp_path / "a.npy", np.ones((2, 181)))
+    tail = f"181 {' '.join(['1'] * 181)} 0 1 2 3 1 2 3 0 0 0 0 0 5 h 5"
+    (tmp_path / "a.g2o").write_text(
+        f"VERTEX_SE2 0 1 2 3\nROBOTLASER1 0 -1.5 3 0.017 80 0.1 0 {tail}\n"
+    )
+    for name in ("a.csv", "a.npy", "a.g2o"):
+        assert len(list(open_log(tmp_path / name)))
+        with pytest.raises(LogError, match=r"are the laser's, .*T_base_laser, --laser.*--poses"):
+            open_log(tmp_path / name, T_base_laser=Pose2D(0.2))
+
+
 def test_rostopic_writes_a_table_that_is_read(tmp_path: Path) -> None:
     names = ["%time", "field.header.seq", "field.header.stamp", "field.header.frame_id"]
     names += ["field.angle_min", "field.angle_max", "field.angle_increment", "field.range_min"]

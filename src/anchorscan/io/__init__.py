@@ -67,7 +67,8 @@ def open_log(
         odometry_topic: Topic of odometry, or "/tf", of a ROS recording; guessed when there is
             one.
         T_base_laser: Where the laser sits on the robot, instead of what a ROS recording or a
-            CARMEN log says; for ``poses`` of the base, of any log.
+            CARMEN log says; for ``poses`` of the base, of any log.  Without ``poses`` other logs
+            have no use for it, which is an error.
         is_upside_down: Whether the laser hangs with its z axis down, instead of what a ROS
             recording says in /tf; all others hold scans as if it stood.
         base_frame_id: Name of the robot's base in /tf; else that of the odometry, or the usual
@@ -114,6 +115,13 @@ def open_log(
     log = _open_file(path, magic, field_of_view, range_max, pose_columns, T_base_laser)
     log = TurnedLog(log) if is_upside_down else log
     if poses is None:
+        if T_base_laser is not None and log.format != CarmenLog.format:
+            raise LogError(
+                f"the poses of a {log.format} file are the laser's, so where it sits on the robot "
+                "(T_base_laser, --laser) would change nothing; leave it out, or give poses of the "
+                "robot (poses, --poses)",
+                path,
+            )
         return log
     tum = _tum_file(poses, path)
     if tum is None:
