@@ -222,8 +222,11 @@ class BagLog(Log):
             return Record(number - 1, None, None, None, time, source, problem)
         stamp = stamp_of(message.header, time)
         if frame_name(message.header.frame_id) != self._frame:
-            report(number, f"the scan is of another frame, {message.header.frame_id!r}")
-            return Record(number - 1, scan, None, None, stamp, source, problem)
+            # Another laser, which may hang where this one stands.
+            other = f"the scan is of another frame, {message.header.frame_id!r}"
+            if scan is not None:
+                report(number, other)
+            return Record(number - 1, None, None, None, stamp, source, problem or other)
         return Record(
             number - 1,
             scan,
@@ -270,6 +273,7 @@ class _Setup:
         child = recording.child_of(self._odometry_topic)
         named = options.base_frame_id
         self._bases = [frame_name(named)] if named else [child, *_USUAL_BASES]
+        self._told_base, self._told_mounting = self._read_mounting()
         self._base, self._mounting = self._find_mounting()
 
     @property
@@ -284,8 +288,9 @@ class _Setup:
         Raises:
             LogError: It does neither stand nor hang.
         """
-        angle = 0.0 if self._mounting is None else tilt(self._mounting)
-        if _LEVEL < angle < math.pi - _LEVEL:
+        angle = 0.0 if self._told_mounting is None else tilt(self._told_mounting)
+        is_given = self._options.T_base_laser is not None
+        if _LEVEL < angle < math.pi - _LEVEL and not is_given:
             raise LogError(
                 f"the laser ({self._laser}) is tilted by {math.degrees(angle):.0f} degrees, so "
                 "its scans do not show the walls of a plan; if /tf is wrong, give T_base_laser",
@@ -293,7 +298,8 @@ class _Setup:
             )
         if self._options.is_upside_down is not None:
             return self._options.is_upside_down
-        return angle > math.pi - _LEVEL
+        # A place given in the plane does not say which way up.
+        return angle > math.pi / 2.0
 
     def odometry(self) -> _Source | None:
         """Return ``T_odom_laser`` over time, or None where nothing tells."""
@@ -345,6 +351,10 @@ class _Setup:
         if given is not None:
             known = (base for base in self._bases if base and base in self._tree)
             return next(known, self._bases[0] or _USUAL_BASES[0]), from_pose(given)
+        return self._told_base, self._told_mounting
+
+    def _read_mounting(self) -> tuple[str, NDArray[np.float64] | None]:
+        """Return the name of the base and ``T_base_laser`` in space, as ``/tf`` has them."""
         for base in self._bases:
             if base and self._laser:
                 same = base == self._laser
