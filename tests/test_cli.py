@@ -231,6 +231,17 @@ def test_several_logs_make_one_set(run: Run, records: list[Record], tmp_path: Pa
     assert len(ReferenceSet.open(tmp_path / "both.apr")) == len(records)
 
 
+def test_each_of_several_logs_is_doubted(run: Run, records: list[Record], tmp_path: Path) -> None:
+    far = [
+        replace(each, pose=None if each.pose is None else replace(each.pose, x=1e3 * each.pose.x))
+        for each in records
+    ]
+    logs = [write_log(tmp_path / "a.log", records), write_log(tmp_path / "b.log", far)]
+    built = run("build", *logs, "-o", tmp_path / "ab.apr")
+    (warning,) = [line for line in built.messages if line.startswith("warning: ")]
+    assert warning.startswith(f"warning: {logs[1]}: poses jump by ")
+
+
 def test_a_later_log_is_added_and_references_are_removed(run: Run, tmp_path: Path) -> None:
     building = random_building(5, length=24.0, depth=14.0)
     first = write_log(tmp_path / "1.log", drive(building, seed=3, length=20.0))

@@ -14,7 +14,7 @@ import typer
 
 from ..errors import AnchorscanError
 from .console import progress, refuse_overwriting, say
-from .logs import problems, records_of, refuse_another_frame, refuse_mirrored, stem
+from .logs import records_of, refuse_another_frame, refuse_mirrored, stem
 from .options import LaserOption, LogOptions, SetArgument, SettingsOptions, SharingOptions
 
 if TYPE_CHECKING:
@@ -288,9 +288,9 @@ def _read_piece(piece: tuple[_Recipe, Path]) -> tuple[list[Record], list[str]]:
     from ..io import open_log
 
     recipe, path = piece
-    log = open_log(path, **recipe.reading, **recipe.posing)
-    records = list(log)
-    return records, [*(f"note: {log.path}: {note}" for note in log.notes), *problems(log)]
+    told: list[str] = []
+    records = list(records_of(open_log(path, **recipe.reading, **recipe.posing), tell=told.append))
+    return records, told
 
 
 def _write_index(path: Path, wanted: bool | None) -> None:
