@@ -613,6 +613,23 @@ def test_no_command_writes_over_what_it_reads(
     assert before == {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="closes streams as a POSIX shell does")
+def test_a_stream_that_was_closed_is_no_mistake_of_ours(log: Path, places: Path) -> None:
+    def closed(number: int, *words: object) -> Outcome:
+        shell = ("sh", "-c", f'exec "$@" {number}>&-', "sh")
+        done = subprocess.run(
+            [*shell, *command(*words)], capture_output=True, text=True, check=False
+        )
+        return Outcome(done.returncode, done.stdout, done.stderr)
+
+    assert_one_line_error(closed(1, "info", places), "Bad file descriptor")
+    told = closed(2, "locate", places, log)
+    assert (told.code, told.err) == (0, "")
+    assert len(told.lines) == len(log.read_text(encoding="ascii").splitlines())
+    assert closed(1, "locate", places, log, "-o", log.parent / "closed.jsonl").code == 0
+    assert closed(0, "info", places).code == 0
+
+
 # Commands that make no sense: exit code 2, nothing done
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import logging
 import os
@@ -12,13 +13,21 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from functools import wraps
 from pathlib import Path
-from typing import Any, TextIO, TypeVar
+from typing import Any, TextIO, TypeVar, cast
 
 import typer
 
 from ..errors import AnchorscanError, LogError
 
-__all__ = ["FAILED", "guarded", "progress", "refuse_overwriting", "say", "write_lines"]
+__all__ = [
+    "FAILED",
+    "guarded",
+    "open_closed_streams",
+    "progress",
+    "refuse_overwriting",
+    "say",
+    "write_lines",
+]
 
 Command = TypeVar("Command", bound=Callable[..., None])
 Item = TypeVar("Item")
@@ -28,6 +37,29 @@ _PROGRESS_DELAY = 1.0
 _PROGRESS_INTERVAL = 0.1
 # What a folder that is read is made of: sets, and the parts of a recording.
 _PARTS = (".apr", ".db3", ".mcap", ".yaml")
+
+
+def open_closed_streams() -> None:
+    """Put something in the place of standard streams that the caller closed, as ``>&-`` does.
+
+    Python has none of them then, and the next file that is opened takes the number of one: what
+    a library complains of would be written into it.  Messages go nowhere, and results are an
+    error as of any file that cannot be written.
+    """
+    if sys.stdin is None:
+        sys.stdin = _nowhere(0, "r")
+    if sys.stdout is None:
+        sys.stdout = _nowhere(1, "w", os.O_RDONLY)
+    if sys.stderr is None:
+        sys.stderr = _nowhere(2, "w")
+
+
+def _nowhere(number: int, mode: str, flags: int = os.O_RDWR) -> TextIO:
+    opened = os.open(os.devnull, flags)
+    if opened != number:
+        os.dup2(opened, number)
+        os.close(opened)
+    return cast(TextIO, open(number, mode, closefd=False))
 
 
 def guarded(command: Command) -> Command:
@@ -43,8 +75,8 @@ def guarded(command: Command) -> Command:
             say(f"error: {error}")
             raise typer.Exit(FAILED) from None
         except BrokenPipeError:
-            # Whoever read us (head, less) has seen enough; what is buffered has no reader.
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            # Whoever read us (head, less) has seen enough.
+            _drop_results()
             raise typer.Exit(128 + signal.SIGPIPE) from None
         except (KeyboardInterrupt, SystemError) as error:
             if not _is_interruption(error):
@@ -53,11 +85,18 @@ def guarded(command: Command) -> Command:
         except OSError as error:
             if error.filename is None and error.errno is None:
                 raise
+            if error.errno == errno.EBADF:
+                _drop_results()
             place = "" if error.filename is None else f"{error.filename}: "
             say(f"error: {place}{error.strerror}")
             raise typer.Exit(FAILED) from None
 
     return guarded  # type: ignore[return-value]
+
+
+def _drop_results() -> None:
+    """Let go what is buffered for a stdout that takes nothing, or Python complains at its end."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _is_interruption(error: BaseException | None) -> bool:
