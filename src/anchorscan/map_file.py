@@ -29,7 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .errors import LogError, MissingExtraError
-from .occupancy import OccupancyGrid
+from .occupancy import LARGEST_RESOLUTION, OccupancyGrid
 from .pose import Pose2D
 
 __all__ = ["load_map", "write_map"]
@@ -144,8 +144,12 @@ def _read_yaml(path: Path) -> _Keys:
     if negate not in (0, 1):
         raise LogError(f"negate must be 0 or 1, not {_shown(negate)}", path)
     resolution = _number(raw, "resolution", path)
-    if resolution <= 0.0:
-        raise LogError(f"the resolution must be positive metres, not {resolution:g}", path)
+    if not 0.0 < resolution <= LARGEST_RESOLUTION:
+        raise LogError(
+            f"the resolution must be positive metres up to {LARGEST_RESOLUTION:g}, "
+            f"not {resolution:g}",
+            path,
+        )
     occupied = _number(raw, "occupied_thresh", path, 0.65)
     free = _number(raw, "free_thresh", path, 0.25)
     if not 0.0 <= free < occupied <= 1.0:
@@ -291,6 +295,8 @@ def _parse_pgm(content: bytes, path: Path) -> _Image:
     promised = 2 * columns * rows - 1 if is_plain else columns * rows * width
     if len(body) < promised:
         raise LogError(f"ends before its {columns} x {rows} pixels are complete", path)
+    if len(body) > promised and content[header.end() : header.end() + 2] == b"\r\n":
+        body = body[1:]  # an editor of Windows ended the lines of the header
     if is_plain:
         levels = _plain_levels(content[header.end() :], columns * rows, path)
     else:
