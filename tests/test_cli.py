@@ -630,6 +630,21 @@ def test_a_stream_that_was_closed_is_no_mistake_of_ours(log: Path, places: Path)
     assert closed(0, "info", places).code == 0
 
 
+@pytest.mark.skipif(not Path("/dev/stdout").exists(), reason="there is no /dev/stdout here")
+def test_what_goes_to_stdout_by_name_is_appended_where_that_stands(
+    log: Path, places: Path, tmp_path: Path
+) -> None:
+    kept = tmp_path / "kept.jsonl"
+    kept.write_text("before\n")
+    words = command("locate", places, log, "-o", "/dev/stdout")
+    with kept.open("a") as stream:
+        subprocess.run(words, stdout=stream, stderr=subprocess.DEVNULL, check=True)
+        subprocess.run(["echo", "after"], stdout=stream, check=True)
+    first, *lines, last = kept.read_text().splitlines()
+    assert (first, last) == ("before", "after")
+    assert len(lines) == len(log.read_text(encoding="ascii").splitlines())
+
+
 # Commands that make no sense: exit code 2, nothing done
 
 

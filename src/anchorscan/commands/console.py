@@ -17,7 +17,7 @@ from typing import Any, TextIO, TypeVar, cast
 
 import typer
 
-from ..errors import AnchorscanError, LogError
+from ..errors import AnchorscanError
 
 __all__ = [
     "FAILED",
@@ -176,22 +176,10 @@ def _writing(path: Path | None) -> Iterator[TextIO]:
     if path is None:
         yield sys.stdout
         return
-    target = path.resolve()
-    if target.exists() and not target.is_file():  # a pipe or a device is written, not replaced
-        with target.open("w", encoding="utf-8") as stream:
-            yield stream
-        return
-    draft = target.with_name(f".{target.name}.{os.getpid()}.part")
-    try:
-        with draft.open("w", encoding="utf-8") as stream:
-            yield stream
-        draft.replace(target)
-    except OSError as error:
-        if isinstance(error, BrokenPipeError):
-            raise
-        raise LogError(f"cannot be written: {error.strerror}", path) from None
-    finally:
-        draft.unlink(missing_ok=True)
+    from ..io.whole_file import writing
+
+    with writing(path) as stream:
+        yield stream
 
 
 def progress(items: Iterable[Item], what: str, total: int | None = None) -> Iterator[Item]:
