@@ -552,6 +552,23 @@ def test_settings_that_cannot_be_are_one_clear_line(
     assert_one_line_error(run("locate", places, log, "--settings", file), file, word)
 
 
+def test_what_was_meant_is_said(run: Run, log: Path, places: Path, tmp_path: Path) -> None:
+    swapped = run("locate", log, places)
+    assert_one_line_error(swapped, places, "is a reference set, not a log")
+    image = tmp_path / "map.pgm"
+    image.write_bytes(b"P5\n1 1\n255\n\0")
+    assert_one_line_error(
+        run("build", image, "-o", tmp_path / "a.apr"), image, "give the YAML file"
+    )
+    assert_one_line_error(run("check-map", image, log), image, "give the YAML file")
+    assert_one_line_error(run("bench", log, "--protocol", "P9"), "P1, P2, P3, P4, P5")
+    narrow = run("locate", places, log, "--field-of-view", "3.14")
+    assert "--field-of-view 3.14 is very narrow" in narrow.messages[0]
+    assert "3.14 radians are 180 degrees" in narrow.messages[0]
+    followed = run("track", places, log)
+    assert followed.messages[-1].startswith(f"{log}: located at ")
+
+
 def test_an_output_that_cannot_be_written_is_one_clear_line(
     run: Run, log: Path, places: Path, tmp_path: Path
 ) -> None:

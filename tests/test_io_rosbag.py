@@ -200,7 +200,7 @@ def test_without_a_mounting_there_is_no_odometry_of_the_laser(
     drive(messages)
     path = messages.write(tmp_path)
     log = open_log(path)
-    assert "where the laser sits on the robot is not known (T_base_laser)" in log.notes
+    assert "where the laser sits on the robot is not known (T_base_laser, --laser)" in log.notes
     assert "no odometry" in log.notes
     assert all(record.odometry is None and record.T_base_laser is None for record in log)
     first = read(path, T_base_laser=Pose2D(0.3, 0, 1))[0]

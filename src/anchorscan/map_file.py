@@ -34,6 +34,8 @@ from .pose import Pose2D
 
 __all__ = ["load_map", "write_map"]
 
+_IMAGE_SUFFIXES = (".pgm", ".png", ".bmp", ".jpg", ".jpeg")
+
 _MODES = ("trinary", "scale", "raw")
 # Below this, 205 is unknown to map_server too: the value that ROS 1 writes.
 _SAVED_FREE_THRESHOLD = 0.196
@@ -168,6 +170,8 @@ def _parse_yaml(path: Path) -> dict[Any, Any]:
         import yaml
     except ImportError:
         raise MissingExtraError("reading a map", "maps") from None
+    if path.suffix.lower() in _IMAGE_SUFFIXES:
+        raise LogError("is the image of a map; give the YAML file that names it", path)
     content = _read_bytes(path, _LARGEST_YAML)
     try:
         # Nested brackets take PyYAML quadratic time.

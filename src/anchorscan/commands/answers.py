@@ -157,7 +157,7 @@ def track(
         accepted += line["accepted"]
         if line["accepted"] and line["stamp"] is not None:
             trajectory.append((line["stamp"], _pose_of(line)))
-    say(f"{log}: {count} scans: located after {accepted}, not known after {count - accepted}")
+    say(f"{log}: located at {accepted} of {count} scans")
     if tum is not None:
         if accepted and not trajectory:
             raise LogError("has no times, and a trajectory in TUM format needs them", log)

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 __all__ = ["add", "build"]
 
-_MAP_SUFFIXES = (".yaml", ".yml")
+_MAP_SUFFIXES = (".yaml", ".yml", ".pgm", ".png", ".bmp", ".jpg", ".jpeg")
 # Sets of fewer references open in a moment without an index.
 _WORTH_AN_INDEX = 1000
 
@@ -215,6 +215,7 @@ class _Recipe:
 
 
 def _is_map(path: Path) -> bool:
+    """Tell whether a file is a map, or the image of one, of which `load_map` says more."""
     return path.suffix.lower() in _MAP_SUFFIXES
 
 

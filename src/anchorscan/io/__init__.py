@@ -27,7 +27,7 @@ from .turned_log import TurnedLog
 __all__ = ["Log", "Problem", "open_log", "write_tum"]
 
 _HEAD = 1 << 20
-_MAGIC_LENGTH = 16
+_MAGIC_LENGTH = 72
 _FIELD_OF_VIEW_LIMIT = 2.0 * math.pi + 1e-4
 
 
@@ -156,9 +156,14 @@ def _open_file(
 
 def _check(field_of_view: float | None, range_max: float | None) -> None:
     if field_of_view is not None and not 0.0 < field_of_view <= _FIELD_OF_VIEW_LIMIT:
-        raise LogError(f"field_of_view must lie in (0, 2 pi] radians, not {field_of_view:g}")
+        raise LogError(
+            f"field_of_view must lie in (0, 2 pi] radians, --field-of-view in (0, 360] degrees, "
+            f"not {field_of_view:g} radians"
+        )
     if range_max is not None and not 0.0 < range_max < math.inf:
-        raise LogError(f"range_max must be a positive length in metres, not {range_max:g}")
+        raise LogError(
+            f"range_max (--range-max) must be a positive length in metres, not {range_max:g}"
+        )
 
 
 def _magic(path: Path) -> bytes:
