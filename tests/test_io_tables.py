@@ -154,7 +154,7 @@ def test_angles_that_were_guessed_are_told(tmp_path: Path, name: str) -> None:
         path.write_text(("\n" + ",".join(["1.0"] * 360)) * 2)
     (note,) = open_log(path).notes
     assert note.startswith(
-        "360 readings from -90 to 89.5 degrees, up to 80 m; the angles are guess"
+        "360 readings from -90 to 89.5 degrees, up to 80 m; guessed from their number"
     )
     assert "--field-of-view" in note
     (note,) = open_log(path, field_of_view=2.0 * math.pi).notes
@@ -202,7 +202,7 @@ def write_table(path: Path, told: dict[str, float], count: int = 5) -> Path:
 def test_readings_with_a_gap_in_their_numbers_are_not_closed_up(tmp_path: Path) -> None:
     path = tmp_path / "a.csv"
     path.write_text("angle_min,angle_increment,r1,r2,r4\n0,0.1,1,2,4\n")
-    with pytest.raises(LogError, match=r"a\.csv:1: has no column of reading 3;"):
+    with pytest.raises(LogError, match=r"a\.csv:1: has no column of reading 3:"):
         open_log(path)
     path.write_text("angle_min,angle_increment,r1,r2,r3,r4\n0,0.1,1,2,,4\n")
     (record,) = open_log(path)

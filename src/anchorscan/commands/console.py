@@ -85,9 +85,10 @@ def guarded(command: Command) -> Command:
         except OSError as error:
             if error.filename is None and error.errno is None:
                 raise
-            if error.errno == errno.EBADF:
-                _drop_results()
             place = "" if error.filename is None else f"{error.filename}: "
+            if error.errno == errno.EBADF:  # as of a stdout that the caller closed
+                _drop_results()
+                place = "results cannot be written: "
             say(f"error: {place}{error.strerror}")
             raise typer.Exit(FAILED) from None
 

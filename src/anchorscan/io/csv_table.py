@@ -131,8 +131,8 @@ class CsvLog(Log):
                 columns = _name_columns(_cells(line, delimiter))
                 if columns.first_missing is not None:
                     raise LogError(
-                        f"has no column of reading {columns.first_missing}; where the others look "
-                        "is not known then: number them without gaps, and leave cells empty",
+                        f"has no column of reading {columns.first_missing}: number the readings "
+                        "without gaps, and leave cells empty",
                         self.path,
                         number,
                     )

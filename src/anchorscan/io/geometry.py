@@ -162,8 +162,8 @@ def geometry_note(scan: LaserScan, *, is_guessed: bool) -> str:
     if not is_guessed:
         return note
     return (
-        f"{note}; the angles are guessed from the number of readings: if they cover others, such "
-        "as 360 degrees, give the field of view (field_of_view, --field-of-view)"
+        f"{note}; guessed from their number, give the field of view (field_of_view, "
+        "--field-of-view) if it is another, such as 360 degrees"
     )
 
 
