@@ -294,6 +294,17 @@ class TestWrongMeaning:
         assert "ranges in millimetres" in doubts([tenfold(r, 1e5) for r in records])
         assert "ranges in millimetres" in doubts([tenfold(r, 80.0) for r in records[:20]])
 
+    def test_poses_that_are_missing_here_and_there_are_no_jumps(
+        self, records: list[Record]
+    ) -> None:
+        far = Pose2D(50.0, 0.0, 1.0)
+        gappy = [
+            replace(r, pose=r.pose if r.index % 2 else None, odometry=far @ r.pose)
+            for r in records
+            if r.pose is not None
+        ]
+        assert doubts(gappy) == ""
+
     def test_positions_in_millimetres_are_noticed(self, records: list[Record]) -> None:
         wrong = [
             replace(r, pose=Pose2D(1000 * r.pose.x, 1000 * r.pose.y, r.pose.theta))

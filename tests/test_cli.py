@@ -246,6 +246,17 @@ def test_several_logs_make_one_set(run: Run, records: list[Record], tmp_path: Pa
     assert len(ReferenceSet.open(tmp_path / "both.apr")) == len(records)
 
 
+def test_each_of_several_logs_is_doubted(run: Run, records: list[Record], tmp_path: Path) -> None:
+    far = [
+        replace(each, pose=None if each.pose is None else replace(each.pose, x=1e3 * each.pose.x))
+        for each in records
+    ]
+    logs = [write_log(tmp_path / "a.log", records), write_log(tmp_path / "b.log", far)]
+    built = run("build", *logs, "-o", tmp_path / "ab.apr")
+    (warning,) = [line for line in built.messages if line.startswith("warning: ")]
+    assert warning.startswith(f"warning: {logs[1]}: poses jump by ")
+
+
 def test_a_later_log_is_added_and_references_are_removed(run: Run, tmp_path: Path) -> None:
     building = random_building(5, length=24.0, depth=14.0)
     first = write_log(tmp_path / "1.log", drive(building, seed=3, length=20.0))
@@ -556,6 +567,23 @@ def test_settings_that_cannot_be_are_one_clear_line(
     assert_one_line_error(run("locate", places, log, "--settings", file), file, word)
 
 
+def test_what_was_meant_is_said(run: Run, log: Path, places: Path, tmp_path: Path) -> None:
+    swapped = run("locate", log, places)
+    assert_one_line_error(swapped, places, "is a reference set, not a log")
+    image = tmp_path / "map.pgm"
+    image.write_bytes(b"P5\n1 1\n255\n\0")
+    assert_one_line_error(
+        run("build", image, "-o", tmp_path / "a.apr"), image, "give the YAML file"
+    )
+    assert_one_line_error(run("check-map", image, log), image, "give the YAML file")
+    assert_one_line_error(run("bench", log, "--protocol", "P9"), "P1, P2, P3, P4, P5")
+    narrow = run("locate", places, log, "--field-of-view", "3.14")
+    assert "--field-of-view 3.14 is very narrow" in narrow.messages[0]
+    assert "3.14 radians are 180 degrees" in narrow.messages[0]
+    followed = run("track", places, log)
+    assert followed.messages[-1].startswith(f"{log}: located at ")
+
+
 def test_an_output_that_cannot_be_written_is_one_clear_line(
     run: Run, log: Path, places: Path, tmp_path: Path
 ) -> None:
@@ -578,6 +606,75 @@ def test_a_full_disk_is_one_clear_line(log: Path, places: Path, way: str) -> Non
             check=False,
         )
     assert_one_line_error(Outcome(done.returncode, "", done.stderr), "No space left")
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("locate", "SET", "LOG", "-o", "LOG"),
+        ("locate", "SET", "LOG", "-o", "SET"),
+        ("locate", "SET", "LOG", "-o", "LINK"),
+        ("locate", "SET", "LOG", "--settings", "FILE", "-o", "FILE"),
+        ("which", "SET", "LOG", "-o", "LOG"),
+        ("which", "FOLDER", "LOG", "-o", "SET"),
+        ("track", "SET", "LOG", "-o", "LOG"),
+        ("track", "SET", "LOG", "--tum", "SET"),
+        ("track", "SET", "LOG", "-o", "NEW", "--tum", "NEW"),
+        ("build", "LOG", "-o", "LOG"),
+        ("build", "LOG", "--poses", "FILE", "-o", "FILE"),
+        ("report", "FILE", "-o", "FILE"),
+        ("report", "FILE", "--set", "SET", "-o", "SET"),
+        ("report", "FILE", "--log", "LOG", "-o", "LOG"),
+        ("view", "SET", "LOG", "-o", "SET"),
+    ],
+    ids=" ".join,
+)
+def test_no_command_writes_over_what_it_reads(
+    run: Run, log: Path, places: Path, tmp_path: Path, words: tuple[str, ...]
+) -> None:
+    names = {"SET": "sets/a.apr", "LOG": "a.log", "LINK": "b.log", "FILE": "f", "NEW": "new"}
+    files = {word: tmp_path / name for word, name in names.items()} | {"FOLDER": tmp_path / "sets"}
+    files["FOLDER"].mkdir()
+    files["SET"].write_bytes(places.read_bytes())
+    files["LOG"].write_bytes(log.read_bytes())
+    files["LINK"].symlink_to(files["LOG"])
+    files["FILE"].write_text("{}")
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+    said = [files.get(word, word) for word in words]
+    assert_one_line_error(run(*said), said[-1], "name another")
+    assert before == {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="closes streams as a POSIX shell does")
+def test_a_stream_that_was_closed_is_no_mistake_of_ours(log: Path, places: Path) -> None:
+    def closed(number: int, *words: object) -> Outcome:
+        shell = ("sh", "-c", f'exec "$@" {number}>&-', "sh")
+        done = subprocess.run(
+            [*shell, *command(*words)], capture_output=True, text=True, check=False
+        )
+        return Outcome(done.returncode, done.stdout, done.stderr)
+
+    assert_one_line_error(closed(1, "info", places), "Bad file descriptor")
+    told = closed(2, "locate", places, log)
+    assert (told.code, told.err) == (0, "")
+    assert len(told.lines) == len(log.read_text(encoding="ascii").splitlines())
+    assert closed(1, "locate", places, log, "-o", log.parent / "closed.jsonl").code == 0
+    assert closed(0, "info", places).code == 0
+
+
+@pytest.mark.skipif(not Path("/dev/stdout").exists(), reason="there is no /dev/stdout here")
+def test_what_goes_to_stdout_by_name_is_appended_where_that_stands(
+    log: Path, places: Path, tmp_path: Path
+) -> None:
+    kept = tmp_path / "kept.jsonl"
+    kept.write_text("before\n")
+    words = command("locate", places, log, "-o", "/dev/stdout")
+    with kept.open("a") as stream:
+        subprocess.run(words, stdout=stream, stderr=subprocess.DEVNULL, check=True)
+        subprocess.run(["echo", "after"], stdout=stream, check=True)
+    first, *lines, last = kept.read_text().splitlines()
+    assert (first, last) == ("before", "after")
+    assert len(lines) == len(log.read_text(encoding="ascii").splitlines())
 
 
 # Commands that make no sense: exit code 2, nothing done

@@ -248,9 +248,16 @@ def test_a_trajectory_written_twice_is_poses_and_no_odometry(write: Callable[...
     assert all(record.pose is None for record in raw)
 
 
-def test_one_damaged_number_does_not_make_odometry(write: Callable[..., Path]) -> None:
-    path = write(drive(200, odometry=lambda i: (i + 5.0 * (i == 99), 0.0, 0.0)))
+@pytest.mark.parametrize("damaged", [0, 99])
+def test_one_damaged_number_does_not_make_odometry(
+    write: Callable[..., Path], damaged: int
+) -> None:
+    path = write(drive(200, odometry=lambda i: (i + 5.0 * (i == damaged), 0.0, 0.0)))
     assert all(record.odometry is None for record in read(path))
+    path = write(drive(200, odometry=lambda i: (i - 0.3 + 5.0 * (i == damaged), 0.0, 0.0)))
+    (mounting,) = {record.T_base_laser for record in read(path)}
+    assert mounting is not None
+    assert mounting.distance(Pose2D(0.3)) < 1e-9
 
 
 def test_columns_that_nobody_filled_in_are_not_poses(write: Callable[..., Path]) -> None:

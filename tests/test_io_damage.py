@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import gzip
 import io
+import os
+import tempfile
 import zipfile
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +15,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from anchorscan import LogError, open_log
+from anchorscan import LogError, ReferenceSet, ReferenceSetError, open_log
 
 LASER = " ".join(f"{1 + 0.01 * i:.2f}" for i in range(181))
 
@@ -124,3 +127,48 @@ def test_any_bytes_give_a_clear_line_or_sound_records(
         path = tmp_path_factory.mktemp("bytes") / "log"
         path.write_bytes(magic + content)
         check(path)
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="there are no named pipes here")
+def test_a_pipe_is_refused_before_it_is_read(tmp_path: Path) -> None:
+    pipe, log = tmp_path / "pipe", tmp_path / "a.log"
+    os.mkfifo(pipe)
+    log.write_bytes(carmen())
+    with pytest.raises(LogError, match=r"pipe: is no file, .*: write it to a file first"):
+        open_log(pipe)
+    with pytest.raises(LogError, match=r"pipe: is no file, .*: write it to a file first"):
+        open_log(log, poses=pipe)
+
+
+@pytest.fixture
+def locked() -> Iterator[Path]:
+    """A folder that may not be looked into, with a log and a set in it."""
+    with tempfile.TemporaryDirectory() as name:
+        Path(name).chmod(0o755)
+        folder = Path(name) / "locked"
+        folder.mkdir()
+        (folder / "a.log").write_bytes(carmen())
+        ReferenceSet(path=folder / "a.apr").close()
+        (Path(name) / "b.log").write_bytes(carmen())
+        folder.chmod(0)
+        is_root = os.geteuid() == 0  # who may look into everything
+        if is_root:
+            os.seteuid(65534)
+        yield folder
+        if is_root:
+            os.seteuid(0)
+        folder.chmod(0o700)
+
+
+@pytest.mark.skipif(not hasattr(os, "seteuid"), reason="there are no such permissions here")
+def test_what_may_not_be_read_is_one_clear_line_that_names_it(locked: Path) -> None:
+    for path in (locked, locked / "a.log"):
+        with pytest.raises(LogError) as raised:
+            open_log(path)
+        assert str(raised.value) == f"{path}: cannot be read: Permission denied"
+    with pytest.raises(LogError) as raised:
+        open_log(locked.parent / "b.log", poses=locked / "a.log")
+    assert str(raised.value) == f"{locked / 'a.log'}: cannot be read: Permission denied"
+    with pytest.raises(ReferenceSetError) as refused:
+        ReferenceSet.open(locked / "a.apr")
+    assert str(refused.value).startswith(f"{locked / 'a.apr'}: ")

@@ -200,7 +200,7 @@ def test_without_a_mounting_there_is_no_odometry_of_the_laser(
     drive(messages)
     path = messages.write(tmp_path)
     log = open_log(path)
-    assert "where the laser sits on the robot is not known (T_base_laser)" in log.notes
+    assert "where the laser sits on the robot is not known (T_base_laser, --laser)" in log.notes
     assert "no odometry" in log.notes
     assert all(record.odometry is None and record.T_base_laser is None for record in log)
     first = read(path, T_base_laser=Pose2D(0.3, 0, 1))[0]
@@ -253,6 +253,39 @@ def test_a_hanging_laser_has_its_scan_turned_over(
     expected = points @ matrix.T + (0.2, 0.1)
     level = 1e-5 if math.pi in {roll, pitch} else 0.02
     np.testing.assert_allclose(record.T_base_laser.apply(record.scan.points), expected, atol=level)
+
+
+def test_a_place_in_the_plane_does_not_turn_a_hanging_laser_up(
+    tmp_path: Path, ros2: Messages
+) -> None:
+    turn = rotation(roll=math.pi)
+    ros2.transform(9.9, "base_link", "laser", (0.2, 0.1, 0.3), turn, is_static=True)
+    drive(ros2)
+    path = ros2.write(tmp_path)
+    log = open_log(path, T_base_laser=Pose2D(0.25))
+    record = next(iter(log))
+    assert record.scan is not None
+    assert record.scan.angle_increment == pytest.approx(-0.1)
+    assert record.T_base_laser == Pose2D(0.25)
+    assert any(note.endswith("upside down") for note in log.notes)
+    record = read(path, T_base_laser=Pose2D(0.25), is_upside_down=False)[0]
+    assert record.scan is not None
+    assert record.scan.angle_increment == pytest.approx(0.1)
+
+
+def test_the_scans_of_a_second_laser_on_the_topic_are_counted_and_left_out(
+    tmp_path: Path, ros2: Messages
+) -> None:
+    turn = rotation(roll=math.pi)
+    ros2.transform(9.9, "base_link", "front", is_static=True)
+    ros2.transform(9.9, "base_link", "rear", (-0.2, 0, 0.3), turn, is_static=True)
+    for number, frame in enumerate(["front", "rear", "front"]):
+        ros2.scan(10.0 + number, RANGES, frame=frame)
+    log = open_log(ros2.write(tmp_path))
+    assert [record.scan is None for record in log] == [False, True, False]
+    (problem,) = log.problems
+    assert problem.reason == "the scan is of another frame, 'rear'"
+    assert [record.problem for record in log] == ["", problem.reason, ""]
 
 
 def test_the_caller_may_say_that_the_laser_hangs(tmp_path: Path, ros2: Messages) -> None:

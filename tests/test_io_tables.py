@@ -145,6 +145,95 @@ def test_angles_and_limits_are_those_of_the_table(tmp_path: Path) -> None:
     assert record.scan.is_free.tolist() == [True, False]
 
 
+@pytest.mark.parametrize("name", ["a.npy", "a.csv"])
+def test_angles_that_were_guessed_are_told(tmp_path: Path, name: str) -> None:
+    path = tmp_path / name
+    if name == "a.npy":
+        np.save(path, np.ones((2, 360)))
+    else:
+        path.write_text(("\n" + ",".join(["1.0"] * 360)) * 2)
+    (note,) = open_log(path).notes
+    assert note.startswith(
+        "360 readings from -90 to 89.5 degrees, up to 80 m; guessed from their number"
+    )
+    assert "--field-of-view" in note
+    (note,) = open_log(path, field_of_view=2.0 * math.pi).notes
+    assert note == "360 readings from -180 to 179 degrees, up to 80 m"
+
+
+@pytest.mark.parametrize("kind", ["npz", "csv"])
+@pytest.mark.parametrize(
+    "told",
+    [
+        {"angle_min": -0.5, "angle_max": 0.5},
+        {"angle_max": 0.5, "angle_increment": 0.25},
+        {"angle_min": -0.5, "angle_increment": 0.25, "angle_max": 7.0},
+    ],
+    ids=",".join,
+)
+def test_two_of_three_angles_are_enough(tmp_path: Path, kind: str, told: dict[str, float]) -> None:
+    log = open_log(write_table(tmp_path / f"a.{kind}", told))
+    (record,) = log
+    assert record.scan is not None
+    np.testing.assert_allclose(record.scan.angles, [-0.5, -0.25, 0.0, 0.25, 0.5])
+    assert "guessed" not in log.notes[0]
+
+
+@pytest.mark.parametrize("kind", ["npz", "csv"])
+@pytest.mark.parametrize("name", ["angle_min", "angle_max", "angle_increment"])
+def test_one_angle_alone_is_refused(tmp_path: Path, kind: str, name: str) -> None:
+    path = write_table(tmp_path / f"a.{kind}", {name: 0.5}, count=181)
+    with pytest.raises(LogError, match=f"{name} alone does not say"):
+        open_log(path)
+    assert len(list(open_log(path, field_of_view=math.pi))) == 1
+
+
+def write_table(path: Path, told: dict[str, float], count: int = 5) -> Path:
+    """Write one scan with some angles."""
+    if path.suffix == ".npz":
+        np.savez(path, ranges=np.ones((1, count)), **told)
+        return path
+    names = [*told, *(f"r{number}" for number in range(count))]
+    cells = [*told.values(), *[1.0] * count]
+    path.write_text(",".join(names) + "\n" + ",".join(map(str, cells)) + "\n")
+    return path
+
+
+def test_readings_with_a_gap_in_their_numbers_are_not_closed_up(tmp_path: Path) -> None:
+    path = tmp_path / "a.csv"
+    path.write_text("angle_min,angle_increment,r1,r2,r4\n0,0.1,1,2,4\n")
+    with pytest.raises(LogError, match=r"a\.csv:1: has no column of reading 3:"):
+        open_log(path)
+    path.write_text("angle_min,angle_increment,r1,r2,r3,r4\n0,0.1,1,2,,4\n")
+    (record,) = open_log(path)
+    assert record.scan is not None
+    np.testing.assert_array_equal(record.scan.ranges, [1, 2, math.nan, 4])
+
+
+def test_a_cell_that_is_no_number_is_the_one_that_is_named(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text(
+        "frame,angle_min,angle_increment,r0,r1\nlaser,0,1,2,3\nlaser,0,1,2,oops\nlaser,no,1,2,3\n"
+    )
+    log = open_log(tmp_path / "a.csv")
+    reasons = ["", "not a number: 'oops'", "not a number: 'no'"]
+    assert [record.problem for record in log] == reasons
+
+
+def test_a_mounting_that_would_change_nothing_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text("x,y,theta," + ",".join(f"r{i}" for i in range(181)))
+    with (tmp_path / "a.csv").open("a") as stream:
+        stream.write("\n" + ",".join(["1.0"] * 184))
+    np.save(tmp_path / "a.npy", np.ones((2, 181)))
+    tail = f"181 {' '.join(['1'] * 181)} 0 1 2 3 1 2 3 0 0 0 0 0 5 h 5"
+    (tmp_path / "a.g2o").write_text(
+        f"VERTEX_SE2 0 1 2 3\nROBOTLASER1 0 -1.5 3 0.017 80 0.1 0 {tail}\n"
+    )
+    for name in ("a.csv", "a.npy", "a.g2o"):
+        assert list(open_log(tmp_path / name))
+        with pytest.raises(LogError, match=r"are the laser's, .*T_base_laser, --laser.*--poses"):
+            open_log(tmp_path / name, T_base_laser=Pose2D(0.2))
+
+
 def test_rostopic_writes_a_table_that_is_read(tmp_path: Path) -> None:
     names = ["%time", "field.header.seq", "field.header.stamp", "field.header.frame_id"]
     names += ["field.angle_min", "field.angle_max", "field.angle_increment", "field.range_min"]

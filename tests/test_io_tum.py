@@ -48,9 +48,12 @@ def test_what_is_written_is_read_back(
 
 def test_a_pose_that_is_not_finite_is_not_written(tmp_path: Path) -> None:
     with pytest.raises(LogError, match="not finite"):
-        write_tum(tmp_path / "a.tum", [(1.0, Pose2D(math.nan, 0, 0))])
+        write_tum(tmp_path / "a.tum", [(0.0, Pose2D()), (1.0, Pose2D(math.nan, 0, 0))])
+    assert not list(tmp_path.iterdir())
     with pytest.raises(LogError, match="cannot be written"):
         write_tum(tmp_path / "none" / "a.tum", [(1.0, Pose2D())])
+    with pytest.raises(LogError, match="is a folder; name a file in it"):
+        write_tum(tmp_path, [(1.0, Pose2D())])
 
 
 def test_poses_are_interpolated_between_samples_near_in_time(tmp_path: Path) -> None:

@@ -94,6 +94,14 @@ def test_plain_and_wide_images_are_the_same_map(tmp_path: Path) -> None:
         )
 
 
+def test_a_header_with_the_line_ends_of_windows_shifts_nothing(tmp_path: Path) -> None:
+    levels = np.array([[10, 254, 0], [254, 205, 13]], dtype=np.uint8)
+    for end in (b"\n", b"\r\n", b"\r"):  # one white space ends the header, before a pixel of 10
+        header = end.join([b"P5", b"3 2", b"255", b""])
+        grid = load_map(write_files(tmp_path, header + levels.tobytes()))
+        np.testing.assert_array_equal(grid.data, [[0, -1, 100], [100, 0, 100]])
+
+
 def png(pixels: np.ndarray) -> bytes:
     images = pytest.importorskip("PIL.Image")
     stream = io.BytesIO()
@@ -191,6 +199,7 @@ def test_map_that_cannot_be_written_says_so(tmp_path: Path) -> None:
         ({"resolution": None}, "the resolution is missing"),
         ({"resolution": 0}, "resolution must be positive"),
         ({"resolution": -0.05}, "resolution must be positive"),
+        ({"resolution": 1e300}, "resolution must be positive metres up to 1000"),
         ({"resolution": "wide"}, "resolution must be a number, not wide"),
         ({"resolution": True}, "resolution must be a number"),
         ({"resolution": math.nan}, "resolution must be a number"),

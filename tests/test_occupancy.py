@@ -271,6 +271,7 @@ def test_message_fields_become_the_grid() -> None:
         ({"width": -3, "height": -2}, "a map of -3 x -2"),
         ({"resolution": 0.0}, "resolution must be positive"),
         ({"resolution": math.nan}, "resolution must be positive"),
+        ({"resolution": 1e300}, "resolution must be positive metres up to 1000, not 1e"),
         ({"origin": Pose2D(math.inf)}, "origin of the map must be finite"),
     ],
 )
@@ -278,6 +279,15 @@ def test_impossible_message_is_refused(change: dict[str, object], message: str) 
     fields = {"data": [0] * 6, "width": 3, "height": 2, "resolution": 0.1, "origin": Pose2D()}
     with pytest.raises(LogError, match=message):
         OccupancyGrid.from_message(**(fields | change))
+
+
+def test_values_that_are_no_cells_are_refused() -> None:
+    for value in (300, 101, -2, math.nan):
+        with pytest.raises(LogError, match="cells must be -1 or 0 to 100, not from"):
+            OccupancyGrid(np.full((3, 3), value), 0.05)
+    for data in ([[0, 100], [0]], [["free"]], [[None]]):
+        with pytest.raises(LogError, match="a map needs rows and columns"):
+            OccupancyGrid(data, 0.05)  # type: ignore[arg-type]
 
 
 def test_robot_keeps_away_from_unknown_space_but_not_from_specks() -> None:

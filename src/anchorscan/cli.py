@@ -15,7 +15,7 @@ import typer
 
 from . import __version__
 from .commands import answers, build, measures, pictures, servers, sets
-from .commands.console import guarded
+from .commands.console import guarded, open_closed_streams
 from .commands.options import spelled_out
 
 __all__ = ["app", "main"]
@@ -69,6 +69,7 @@ for _command in _COMMANDS:
 
 def main() -> None:
     """Run the command line (the entry point of ``anchorscan``)."""
+    open_closed_streams()
     app()
 
 

@@ -29,10 +29,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .errors import LogError, MissingExtraError
-from .occupancy import OccupancyGrid
+from .occupancy import LARGEST_RESOLUTION, OccupancyGrid
 from .pose import Pose2D
 
 __all__ = ["load_map", "write_map"]
+
+_IMAGE_SUFFIXES = (".pgm", ".png", ".bmp", ".jpg", ".jpeg")
 
 _MODES = ("trinary", "scale", "raw")
 # Below this, 205 is unknown to map_server too: the value that ROS 1 writes.
@@ -144,8 +146,12 @@ def _read_yaml(path: Path) -> _Keys:
     if negate not in (0, 1):
         raise LogError(f"negate must be 0 or 1, not {_shown(negate)}", path)
     resolution = _number(raw, "resolution", path)
-    if resolution <= 0.0:
-        raise LogError(f"the resolution must be positive metres, not {resolution:g}", path)
+    if not 0.0 < resolution <= LARGEST_RESOLUTION:
+        raise LogError(
+            f"the resolution must be positive metres up to {LARGEST_RESOLUTION:g}, "
+            f"not {resolution:g}",
+            path,
+        )
     occupied = _number(raw, "occupied_thresh", path, 0.65)
     free = _number(raw, "free_thresh", path, 0.25)
     if not 0.0 <= free < occupied <= 1.0:
@@ -164,6 +170,8 @@ def _parse_yaml(path: Path) -> dict[Any, Any]:
         import yaml
     except ImportError:
         raise MissingExtraError("reading a map", "maps") from None
+    if path.suffix.lower() in _IMAGE_SUFFIXES:
+        raise LogError("is the image of a map; give the YAML file that names it", path)
     content = _read_bytes(path, _LARGEST_YAML)
     try:
         # Nested brackets take PyYAML quadratic time.
@@ -291,6 +299,8 @@ def _parse_pgm(content: bytes, path: Path) -> _Image:
     promised = 2 * columns * rows - 1 if is_plain else columns * rows * width
     if len(body) < promised:
         raise LogError(f"ends before its {columns} x {rows} pixels are complete", path)
+    if len(body) > promised and content[header.end() : header.end() + 2] == b"\r\n":
+        body = body[1:]  # an editor of Windows ended the lines of the header
     if is_plain:
         levels = _plain_levels(content[header.end() :], columns * rows, path)
     else:

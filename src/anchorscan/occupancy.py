@@ -35,6 +35,7 @@ from .scan import LaserScan
 from .sensor import SensorModel
 
 __all__ = [
+    "LARGEST_RESOLUTION",
     "MAP_SENSOR",
     "OccupancyGrid",
     "cast_rays",
@@ -65,6 +66,10 @@ _HIT_SHARE = 0.25
 # The largest region of unknown cells that is taken for a gap between rays, square metres.
 _SPECK_AREA = 0.02
 _MOST_CELLS = 1 << 28
+_UNKNOWN_VALUE, _LARGEST_VALUE = -1, 100
+
+LARGEST_RESOLUTION = 1000.0
+"""No map has larger cells, metres."""
 
 MAP_SENSOR = SensorModel(2.0 * math.pi, math.radians(0.5), range_max=30.0)
 """Takes the reference scans of a map unless another is given: all around, every half degree."""
@@ -80,7 +85,7 @@ class OccupancyGrid:
     Args:
         data: (H, W) int8: -1 unknown, else the occupancy in percent, 0 to 100; row 0 is the
             lowest y, as in ``nav_msgs/OccupancyGrid`` and unlike an image.
-        resolution: Edge length of a cell, metres.
+        resolution: Edge length of a cell, metres, up to `LARGEST_RESOLUTION`.
         origin: ``T_map_grid``, the pose of the outer corner of cell (0, 0).
         occupied_threshold: A cell is occupied from this share of 100 percent.
         free_threshold: A cell is free up to this share of 100 percent.
@@ -96,11 +101,14 @@ class OccupancyGrid:
     free_threshold: float = 0.25
 
     def __post_init__(self) -> None:
-        data = np.array(self.data, dtype=np.int8)
+        data = _cell_values(self.data)
         if data.ndim != 2 or data.size == 0:
             raise LogError(f"a map needs rows and columns, not shape {data.shape}")
-        if not (math.isfinite(self.resolution) and self.resolution > 0.0):
-            raise LogError(f"the resolution must be positive metres, not {self.resolution}")
+        if not 0.0 < self.resolution <= LARGEST_RESOLUTION:
+            raise LogError(
+                f"the resolution must be positive metres up to {LARGEST_RESOLUTION:g}, "
+                f"not {self.resolution}"
+            )
         if not self.origin.is_finite():
             raise LogError("the origin of the map must be finite")
         if not 0.0 <= self.free_threshold < self.occupied_threshold <= 1.0:
@@ -222,6 +230,24 @@ class OccupancyGrid:
         is_small = sizes * self.resolution**2 <= _SPECK_AREA
         is_small[0] = False
         return np.asarray(is_small[labels])
+
+
+def _cell_values(data: ArrayLike) -> NDArray[np.int8]:
+    """Copy the values of cells.
+
+    Raises:
+        LogError: There is another value than -1 and 0 to 100, or no array.
+    """
+    try:
+        given = np.asarray(data)
+        outside = given.size and not (
+            given.min() >= _UNKNOWN_VALUE and given.max() <= _LARGEST_VALUE
+        )
+    except (TypeError, ValueError) as error:
+        raise LogError(f"a map needs rows and columns of numbers: {error}") from None
+    if outside:
+        raise LogError(f"cells must be -1 or 0 to 100, not from {given.min()} to {given.max()}")
+    return given.astype(np.int8)
 
 
 # --- Scans -----------------------------------------------------------------------------
@@ -377,8 +403,10 @@ def stitch(
     Raises:
         LogError: There is nothing to stitch, or the map would be too large.
     """
-    if not 0.0 < resolution < math.inf:
-        raise LogError(f"the resolution must be positive metres, not {resolution}")
+    if not 0.0 < resolution <= LARGEST_RESOLUTION:
+        raise LogError(
+            f"the resolution must be positive metres up to {LARGEST_RESOLUTION:g}, not {resolution}"
+        )
     beams = [
         _beams(record.scan, record.pose, reach)
         for record in records

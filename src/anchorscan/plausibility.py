@@ -74,7 +74,7 @@ class Plausibility:
         self._ranges: list[float] = []
         self._steps: list[float] = []
         self._courses: list[complex] = []
-        self._pose: Pose2D | None = None
+        self._before: Record | None = None
         self._stamp: float | None = None
         self._stamps = self._repeated = self._reversed = 0
         self._first_wrong = 0
@@ -83,7 +83,7 @@ class Plausibility:
         """Look at the next record."""
         if record.scan is not None:
             self._add_scan(record.scan)
-        self._add_pose(record.pose if record.pose is not None else record.odometry)
+        self._add_poses(record)
         self._add_stamp(record)
 
     def doubts(self) -> list[str]:
@@ -126,9 +126,18 @@ class Plausibility:
             if len(self._ranges) < _MOST_STEPS:
                 self._ranges.append(float(returns[len(returns) // 2]))
 
-    def _add_pose(self, pose: Pose2D | None) -> None:
-        before, self._pose = self._pose, pose
-        if pose is None or before is None or len(self._steps) >= _MOST_STEPS:
+    def _add_poses(self, record: Record) -> None:
+        """Look at the step from the record before, in one frame: that of poses, or odometry."""
+        before, self._before = self._before, record
+        if before is None:
+            return
+        if before.pose is not None and record.pose is not None:
+            self._add_step(before.pose, record.pose)
+        elif before.odometry is not None and record.odometry is not None:
+            self._add_step(before.odometry, record.odometry)
+
+    def _add_step(self, before: Pose2D, pose: Pose2D) -> None:
+        if len(self._steps) >= _MOST_STEPS:
             return
         step = pose.distance(before)
         if step > 0.0:

@@ -387,7 +387,7 @@ class ReferenceSet:
 
     def _index_state(self) -> tuple[str, int | None]:
         """Say what there is of an index, and its size."""
-        if self.path is None or not index_path(self.path).is_file():
+        if self.path is None or not os.path.isfile(index_path(self.path)):
             return "none", None
         size = index_path(self.path).stat().st_size
         try:
@@ -849,7 +849,8 @@ def _read_indexed(path: Path, settings: Settings | None) -> tuple[DerivedIndex, 
     Raises:
         ReferenceSetError: The set's file is damaged, or cannot be read.
     """
-    if not index_path(path).is_file():
+    # `Path.is_file` raises where it may not look; reading the set then says so.
+    if not os.path.isfile(index_path(path)):
         return None
     if settings is None:
         from .settings import Settings

@@ -27,6 +27,7 @@ from . import __version__
 from .answers import Guess, Run, ScanAnswer
 from .errors import AnchorscanError
 from .explanation import bounds_of, centres_of_cells, wall_points
+from .io.whole_file import writing
 from .pose import Pose2D
 from .protocol import Answer, Figures, figures, precision_recall, reliability
 from .record import Record
@@ -120,16 +121,11 @@ def write_report(
 
     Raises:
         AnchorscanError: There is nothing to report.
-        LogError: A log cannot be read.
-        OSError: The file cannot be written.
+        LogError: A log cannot be read, or the file not be written.
     """
     text = page(runs, references, logs, title=title, notes=notes, most=most)
-    draft = path.with_name(f".{path.name}.part")
-    try:
-        draft.write_text(text, encoding="utf-8")
-        draft.replace(path)
-    finally:
-        draft.unlink(missing_ok=True)
+    with writing(path) as stream:
+        stream.write(text)
 
 
 def page(

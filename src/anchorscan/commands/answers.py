@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from ..errors import LogError, ReferenceSetError
-from .console import say, write_lines
+from .console import refuse_overwriting, say, write_lines
 from .logs import records_shown, refuse_mirrored
 from .options import (
     CandidatesOption,
@@ -59,6 +59,7 @@ def locate(
     One JSON object a scan, in the order of the log, hypotheses best first; the poses are those
     of the laser in the frame of the set, in metres and radians.
     """
+    refuse_overwriting([output], [set_file, log, settings.settings_file])
     opened = reading.open(log)
     chosen = settings.read()
     records = records_shown(opened, "locating", output)
@@ -97,6 +98,7 @@ def which(
     *places, log = sets
     if not places:
         raise typer.BadParameter("give reference sets, and a log after them")
+    refuse_overwriting([output], [*sets, settings.settings_file])
     opened = reading.open(log)
     chosen = settings.read()
     records = records_shown(opened, "asking", output)
@@ -143,6 +145,7 @@ def track(
     """
     from ..io import write_tum
 
+    refuse_overwriting([output, tum], [set_file, log, settings.settings_file])
     opened = reading.open(log)
     chosen = settings.read()
     records = records_shown(opened, "tracking", output)
@@ -154,7 +157,7 @@ def track(
         accepted += line["accepted"]
         if line["accepted"] and line["stamp"] is not None:
             trajectory.append((line["stamp"], _pose_of(line)))
-    say(f"{log}: {count} scans: located after {accepted}, not known after {count - accepted}")
+    say(f"{log}: located at {accepted} of {count} scans")
     if tum is not None:
         if accepted and not trajectory:
             raise LogError("has no times, and a trajectory in TUM format needs them", log)

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from ..errors import AnchorscanError
-from .console import progress, say
-from .logs import problems, records_of, refuse_another_frame, refuse_mirrored, stem
+from .console import progress, refuse_overwriting, say
+from .logs import records_of, refuse_another_frame, refuse_mirrored, stem
 from .options import LaserOption, LogOptions, SetArgument, SettingsOptions, SharingOptions
 
 if TYPE_CHECKING:
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 __all__ = ["add", "build"]
 
-_MAP_SUFFIXES = (".yaml", ".yml")
+_MAP_SUFFIXES = (".yaml", ".yml", ".pgm", ".png", ".bmp", ".jpg", ".jpeg")
 # Sets of fewer references open in a moment without an index.
 _WORTH_AN_INDEX = 1000
 
@@ -109,6 +109,7 @@ def build(
 
     Of several logs, one that cannot be read is named and left out.
     """
+    refuse_overwriting([output], [*logs, posing.poses, settings.settings_file])
     chosen = settings.read()
     is_map = any(map(_is_map, logs))
     said = reading.topic or reading.upside_down or posing.poses or posing.laser
@@ -214,6 +215,7 @@ class _Recipe:
 
 
 def _is_map(path: Path) -> bool:
+    """Tell whether a file is a map, or the image of one, of which `load_map` says more."""
     return path.suffix.lower() in _MAP_SUFFIXES
 
 
@@ -287,9 +289,9 @@ def _read_piece(piece: tuple[_Recipe, Path]) -> tuple[list[Record], list[str]]:
     from ..io import open_log
 
     recipe, path = piece
-    log = open_log(path, **recipe.reading, **recipe.posing)
-    records = list(log)
-    return records, [*(f"note: {log.path}: {note}" for note in log.notes), *problems(log)]
+    told: list[str] = []
+    records = list(records_of(open_log(path, **recipe.reading, **recipe.posing), tell=told.append))
+    return records, told
 
 
 def _write_index(path: Path, wanted: bool | None) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import logging
 import os
@@ -12,13 +13,21 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from functools import wraps
 from pathlib import Path
-from typing import Any, TextIO, TypeVar
+from typing import Any, TextIO, TypeVar, cast
 
 import typer
 
-from ..errors import AnchorscanError, LogError
+from ..errors import AnchorscanError
 
-__all__ = ["FAILED", "guarded", "progress", "say", "write_lines"]
+__all__ = [
+    "FAILED",
+    "guarded",
+    "open_closed_streams",
+    "progress",
+    "refuse_overwriting",
+    "say",
+    "write_lines",
+]
 
 Command = TypeVar("Command", bound=Callable[..., None])
 Item = TypeVar("Item")
@@ -26,6 +35,31 @@ Item = TypeVar("Item")
 FAILED = 1
 _PROGRESS_DELAY = 1.0
 _PROGRESS_INTERVAL = 0.1
+# What a folder that is read is made of: sets, and the parts of a recording.
+_PARTS = (".apr", ".db3", ".mcap", ".yaml")
+
+
+def open_closed_streams() -> None:
+    """Put something in the place of standard streams that the caller closed, as ``>&-`` does.
+
+    Python has none of them then, and the next file that is opened takes the number of one: what
+    a library complains of would be written into it.  Messages go nowhere, and results are an
+    error as of any file that cannot be written.
+    """
+    if sys.stdin is None:
+        sys.stdin = _nowhere(0, "r")
+    if sys.stdout is None:
+        sys.stdout = _nowhere(1, "w", os.O_RDONLY)
+    if sys.stderr is None:
+        sys.stderr = _nowhere(2, "w")
+
+
+def _nowhere(number: int, mode: str, flags: int = os.O_RDWR) -> TextIO:
+    opened = os.open(os.devnull, flags)
+    if opened != number:
+        os.dup2(opened, number)
+        os.close(opened)
+    return cast(TextIO, open(number, mode, closefd=False))
 
 
 def guarded(command: Command) -> Command:
@@ -41,8 +75,8 @@ def guarded(command: Command) -> Command:
             say(f"error: {error}")
             raise typer.Exit(FAILED) from None
         except BrokenPipeError:
-            # Whoever read us (head, less) has seen enough; what is buffered has no reader.
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            # Whoever read us (head, less) has seen enough.
+            _drop_results()
             raise typer.Exit(128 + signal.SIGPIPE) from None
         except (KeyboardInterrupt, SystemError) as error:
             if not _is_interruption(error):
@@ -52,10 +86,18 @@ def guarded(command: Command) -> Command:
             if error.filename is None and error.errno is None:
                 raise
             place = "" if error.filename is None else f"{error.filename}: "
+            if error.errno == errno.EBADF:  # as of a stdout that the caller closed
+                _drop_results()
+                place = "results cannot be written: "
             say(f"error: {place}{error.strerror}")
             raise typer.Exit(FAILED) from None
 
     return guarded  # type: ignore[return-value]
+
+
+def _drop_results() -> None:
+    """Let go what is buffered for a stdout that takes nothing, or Python complains at its end."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _is_interruption(error: BaseException | None) -> bool:
@@ -85,6 +127,41 @@ def _tell_of_compiling() -> None:
     log.propagate = False
 
 
+def refuse_overwriting(outputs: Iterable[Path | None], inputs: Iterable[Path | str | None]) -> None:
+    """End before anything is done where a file would be written that is read, or written, too.
+
+    Args:
+        outputs: Files to write; those that nobody asked for are None.
+        inputs: Files and folders to read; names of nothing are no files.
+
+    Raises:
+        AnchorscanError: It would.
+    """
+    written: list[Path] = []
+    read = [Path(path) for path in inputs if path is not None]
+    for path in (path for path in outputs if path is not None):
+        if path.exists() and not path.resolve().is_file():
+            continue  # a pipe or a device loses nothing, and of a folder others complain
+        if any(_is_same(path, other) or _is_part(path, other) for other in read):
+            raise AnchorscanError(f"{path}: is read here, and would be overwritten; name another")
+        if any(_is_same(path, other) for other in written):
+            raise AnchorscanError(f"{path}: would be written twice; name another")
+        written.append(path)
+
+
+def _is_same(a: Path, b: Path) -> bool:
+    """Tell whether two names are of one file, which need not be there."""
+    try:
+        return a.samefile(b)
+    except OSError:
+        return a.resolve() == b.resolve()
+
+
+def _is_part(path: Path, folder: Path) -> bool:
+    """Tell whether a file is what a folder is read for."""
+    return path.suffix in _PARTS and folder.is_dir() and _is_same(path.parent, folder)
+
+
 def write_lines(lines: Iterable[dict[str, Any]], path: Path | None) -> Iterator[dict[str, Any]]:
     """Write lines of JSON as they come, to stdout or to a file, and pass them on."""
     with _writing(path) as stream:
@@ -100,22 +177,10 @@ def _writing(path: Path | None) -> Iterator[TextIO]:
     if path is None:
         yield sys.stdout
         return
-    target = path.resolve()
-    if target.exists() and not target.is_file():  # a pipe or a device is written, not replaced
-        with target.open("w", encoding="utf-8") as stream:
-            yield stream
-        return
-    draft = target.with_name(f".{target.name}.{os.getpid()}.part")
-    try:
-        with draft.open("w", encoding="utf-8") as stream:
-            yield stream
-        draft.replace(target)
-    except OSError as error:
-        if isinstance(error, BrokenPipeError):
-            raise
-        raise LogError(f"cannot be written: {error.strerror}", path) from None
-    finally:
-        draft.unlink(missing_ok=True)
+    from ..io.whole_file import writing
+
+    with writing(path) as stream:
+        yield stream
 
 
 def progress(items: Iterable[Item], what: str, total: int | None = None) -> Iterator[Item]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     from ..reference_set import ReferenceSet
 
 __all__ = [
-    "problems",
     "record_of",
     "records_of",
     "records_shown",
@@ -29,20 +28,21 @@ __all__ = [
 _NAMED_LINES = 5
 
 
-def records_of(*logs: Log) -> Iterator[Record]:
-    """Read logs one after the other; say what was guessed, malformed, or cannot be meant."""
+def records_of(*logs: Log, tell: Callable[[str], None] = say) -> Iterator[Record]:
+    """Read logs one after the other; tell what was guessed, malformed, or cannot be meant."""
     from ..plausibility import Plausibility
 
     for log in logs:
         for note in log.notes:
-            say(f"note: {log.path}: {note}")
+            tell(f"note: {log.path}: {note}")
         plausibility = Plausibility()
         for record in log:
             plausibility.add(record)
             yield record
-        _report_problems(log)
+        for line in _problems(log):
+            tell(line)
         for doubt in plausibility.doubts():
-            say(f"warning: {log.path}: {doubt}")
+            tell(f"warning: {log.path}: {doubt}")
 
 
 def records_shown(log: Log, what: str, output: Path | None) -> Iterator[Record]:
@@ -64,13 +64,7 @@ def record_of(log: Log, index: int) -> Record:
     raise LogError(f"has {count} scans, from 0 on: no scan {index}", log.path)
 
 
-def _report_problems(log: Log) -> None:
-    """Say once which lines of a log were no use."""
-    for line in problems(log):
-        say(line)
-
-
-def problems(log: Log) -> list[str]:
+def _problems(log: Log) -> list[str]:
     """Return a line that names the lines of no use by number, and the first reason; or none."""
     if not log.problem_count:
         return []

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from ..errors import AnchorscanError
 from .console import progress, say
 from .logs import records_of
 from .options import (
@@ -98,6 +99,10 @@ def bench(
     """
     from ..benchmark import BASELINES, PROTOCOLS, run
 
+    for protocol in protocols or ():
+        if protocol not in (*PROTOCOLS, "P5"):
+            listed = ", ".join((*PROTOCOLS, "P5"))
+            raise AnchorscanError(f"unknown protocol {protocol!r}: there are {listed}")
     if protocols and "P5" in protocols:
         _bench_lost_robot(logs, baselines, queries, baseline_queries, seed, output, range_max)
         protocols = [protocol for protocol in protocols if protocol != "P5"]

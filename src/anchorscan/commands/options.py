@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_type_hints
 import typer
 
 from ..errors import SettingsError
+from .console import say
 
 if TYPE_CHECKING:
     from ..cluster import Spread
@@ -46,6 +47,9 @@ __all__ = [
     "UpsideDownOption",
     "spelled_out",
 ]
+
+# No laser scanner sees less, degrees.
+_NARROW = 10.0
 
 Command = TypeVar("Command", bound=Callable[..., None])
 
@@ -206,6 +210,12 @@ class LogOptions:
     def reading(self) -> dict[str, Any]:
         """Return it as ``open_log`` wants it."""
         field_of_view = self.field_of_view
+        if field_of_view is not None and 0.0 < field_of_view < _NARROW:
+            say(
+                f"warning: --field-of-view {field_of_view:g} is very narrow for a laser: it is "
+                f"given in degrees, and {field_of_view:g} radians are "
+                f"{math.degrees(field_of_view):.0f} degrees"
+            )
         return {
             "field_of_view": None if field_of_view is None else math.radians(field_of_view),
             "range_max": self.range_max,

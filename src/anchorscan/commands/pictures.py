@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from ..errors import LogError
-from .console import progress, say
+from .console import progress, refuse_overwriting, say
 from .logs import record_of, records_of, stem
 from .options import (
     CandidatesOption,
@@ -148,6 +148,7 @@ def report(
     from ..answers import read_runs
     from ..report import write_report
 
+    refuse_overwriting([output], [run_file, set_file, *(logs or ())])
     runs = read_runs(run_file)
     opened = {stem(path): reading.open(path) for path in logs or ()}
     references: tuple[Reference, ...] = ()
@@ -196,6 +197,7 @@ def view(
     from ..reference_set import ReferenceSet
     from ..viewer import Viewer
 
+    refuse_overwriting([output], [set_file, log, run_file, settings.settings_file])
     opened = reading.open(log)
     records = progress(records_of(opened), "showing", opened.count)
     with ReferenceSet.open(set_file, settings=settings.read()) as places:

@@ -7,6 +7,7 @@
 from __future__ import annotations
 
 import math
+import stat
 from pathlib import Path
 
 from ..errors import LogError
@@ -26,7 +27,7 @@ from .turned_log import TurnedLog
 __all__ = ["Log", "Problem", "open_log", "write_tum"]
 
 _HEAD = 1 << 20
-_MAGIC_LENGTH = 16
+_MAGIC_LENGTH = 72
 _FIELD_OF_VIEW_LIMIT = 2.0 * math.pi + 1e-4
 
 
@@ -66,7 +67,8 @@ def open_log(
         odometry_topic: Topic of odometry, or "/tf", of a ROS recording; guessed when there is
             one.
         T_base_laser: Where the laser sits on the robot, instead of what a ROS recording or a
-            CARMEN log says; for ``poses`` of the base, of any log.
+            CARMEN log says; for ``poses`` of the base, of any log.  Without ``poses`` other logs
+            have no use for it, which is an error.
         is_upside_down: Whether the laser hangs with its z axis down, instead of what a ROS
             recording says in /tf; all others hold scans as if it stood.
         base_frame_id: Name of the robot's base in /tf; else that of the odometry, or the usual
@@ -87,7 +89,11 @@ def open_log(
     path = Path(path)
     _check(field_of_view, range_max)
     magic = _magic(path)
-    if found := find_bag(path, magic):
+    try:
+        found = find_bag(path, magic)
+    except OSError as error:
+        raise LogError(f"cannot be read: {error.strerror}", path) from None
+    if found:
         tum = _tum_file(poses, path)
         options = BagOptions(
             topic=topic,
@@ -109,6 +115,13 @@ def open_log(
     log = _open_file(path, magic, field_of_view, range_max, pose_columns, T_base_laser)
     log = TurnedLog(log) if is_upside_down else log
     if poses is None:
+        if T_base_laser is not None and log.format != CarmenLog.format:
+            raise LogError(
+                f"the poses of a {log.format} file are the laser's, so where it sits on the robot "
+                "(T_base_laser, --laser) would change nothing; leave it out, or give poses of the "
+                "robot (poses, --poses)",
+                path,
+            )
         return log
     tum = _tum_file(poses, path)
     if tum is None:
@@ -143,9 +156,14 @@ def _open_file(
 
 def _check(field_of_view: float | None, range_max: float | None) -> None:
     if field_of_view is not None and not 0.0 < field_of_view <= _FIELD_OF_VIEW_LIMIT:
-        raise LogError(f"field_of_view must lie in (0, 2 pi] radians, not {field_of_view:g}")
+        raise LogError(
+            f"field_of_view must lie in (0, 2 pi] radians, --field-of-view in (0, 360] degrees, "
+            f"not {field_of_view:g} radians"
+        )
     if range_max is not None and not 0.0 < range_max < math.inf:
-        raise LogError(f"range_max must be a positive length in metres, not {range_max:g}")
+        raise LogError(
+            f"range_max (--range-max) must be a positive length in metres, not {range_max:g}"
+        )
 
 
 def _magic(path: Path) -> bytes:
@@ -153,6 +171,9 @@ def _magic(path: Path) -> bytes:
     try:
         if path.is_dir():
             return b""
+        if not stat.S_ISREG(path.stat().st_mode):
+            # It is read more than once, and a pipe would give every reader another part.
+            raise LogError("is no file, but a pipe or a device: write it to a file first", path)
         with path.open("rb") as stream:
             magic = stream.read(_MAGIC_LENGTH)
     except FileNotFoundError:
@@ -168,8 +189,13 @@ def _magic(path: Path) -> bytes:
 
 def _tum_file(poses: str | Path | None, log: Path) -> TextFile | None:
     """Return the file that ``poses`` names, or None where it names a topic or nothing."""
-    if poses is None or not Path(poses).is_file():
+    if poses is None:
         return None
+    try:
+        if not Path(poses).exists() or Path(poses).is_dir():
+            return None
+    except OSError as error:
+        raise LogError(f"cannot be read: {error.strerror}", poses) from None
     if Path(poses).absolute() == log.absolute():
         raise LogError("is the log itself, not a trajectory", poses)
     return find_text(Path(poses), _magic(Path(poses)))

@@ -7,7 +7,8 @@ The first row may name the columns, in any order and in any case:
 * ``x, y, theta`` (or ``yaw``): the pose of the **laser** in the map;
 * ``odom_x, odom_y, odom_theta``: the pose of the **laser** by odometry;
 * ``stamp``, ``time`` or ``t``: seconds (nanoseconds where the number is that large);
-* ``angle_min, angle_increment, range_min, range_max``: as in a ROS ``LaserScan``.
+* ``angle_min, angle_max, angle_increment, range_min, range_max``: as in a ROS ``LaserScan``;
+  two of the three angles are enough, and one alone is refused.
 
 Other columns are left out.  Without names every column is a reading.  Cells are separated by
 commas, semicolons, tabs or spaces; an empty one is NaN, "no information".  Without angles the
@@ -27,7 +28,7 @@ from ..errors import LogError, ScanError
 from ..pose import Pose2D
 from ..record import Record
 from ..scan import LaserScan
-from .geometry import RANGE_MAX, ScanGeometry, geometry_of, make_scan, spread
+from .geometry import RANGE_MAX, Angles, geometry_note, make_scan
 from .log import Log, Report
 from .text import TextFile, shown
 
@@ -43,6 +44,7 @@ _NAMES = {
     "odom_y": {"odom_y"},
     "odom_theta": {"odom_theta", "odom_yaw"},
     "angle_min": {"angle_min"},
+    "angle_max": {"angle_max"},
     "angle_increment": {"angle_increment"},
     "range_min": {"range_min"},
     "range_max": {"range_max"},
@@ -58,12 +60,13 @@ class _Columns:
     width: int
     readings: Sequence[int]
     named: dict[str, int] = field(default_factory=dict)
+    first_missing: int | None = None
 
     def value(self, cells: Sequence[bytes], name: str) -> float | None:
         at = self.named.get(name)
         if at is None or not cells[at].strip():
             return None
-        return float(cells[at])
+        return _numbers([cells[at]])[0]
 
     def pose(self, cells: Sequence[bytes], prefix: str = "") -> Pose2D | None:
         values = [self.value(cells, prefix + name) for name in ("x", "y", "theta")]
@@ -106,12 +109,15 @@ class CsvLog(Log):
         self._text = text
         self._field_of_view = field_of_view
         self._range_max = range_max
+        self._is_guessed = False  # of the latest scan
         first = next((record for record in self if record.scan is not None), None)
         if first is None:
             if self.problems:
                 problem = self.problems[0]
                 raise LogError(f"no readable laser scan: {problem.reason}", self.path, problem.line)
             raise LogError("a table without rows", self.path)
+        assert first.scan is not None
+        self.notes = (geometry_note(first.scan, is_guessed=self._is_guessed),)
 
     def _read(self, report: Report) -> Iterator[Record]:
         columns: _Columns | None = None
@@ -123,6 +129,13 @@ class CsvLog(Log):
             if columns is None:
                 delimiter = _delimiter(line)
                 columns = _name_columns(_cells(line, delimiter))
+                if columns.first_missing is not None:
+                    raise LogError(
+                        f"has no column of reading {columns.first_missing}: number the readings "
+                        "without gaps, and leave cells empty",
+                        self.path,
+                        number,
+                    )
                 if columns.readings:
                     continue
                 columns = _Columns(columns.width, range(columns.width))
@@ -149,27 +162,25 @@ class CsvLog(Log):
                 source,
             )
         except (ValueError, ScanError) as error:
-            reason = str(error)
-            if reason.startswith("could not convert"):
-                reason = f"not a number: {shown(_first_word(cells) or b'')}"
-            report(number, reason)
-            return Record(index, None, source=source, problem=reason)
+            report(number, str(error))
+            return Record(index, None, source=source, problem=str(error))
 
     def _scan(self, cells: list[bytes], columns: _Columns) -> LaserScan:
-        words = [cells[at] for at in columns.readings]
-        ranges = np.array([float(word) if word.strip() else math.nan for word in words])
+        ranges = np.array(_numbers([cells[at] for at in columns.readings]))
         limit = columns.value(cells, "range_max")
         limit = limit if limit is not None and limit > 0.0 else RANGE_MAX
-        start = columns.value(cells, "angle_min")
-        increment = columns.value(cells, "angle_increment")
-        count = len(ranges)
-        if self._field_of_view is not None:
-            start, increment = spread(self._field_of_view, count)
-        if start is None or increment is None:
-            geometry = geometry_of(count, range_max=limit)
-            start, increment = geometry.angle_min, geometry.angle_increment
-        shortest = columns.value(cells, "range_min") or 0.0
-        geometry = ScanGeometry(start, increment, shortest, limit)
+        angles = Angles(
+            columns.value(cells, "angle_min"),
+            columns.value(cells, "angle_max"),
+            columns.value(cells, "angle_increment"),
+        )
+        geometry = angles.geometry(
+            len(ranges),
+            field_of_view=self._field_of_view,
+            range_min=columns.value(cells, "range_min") or 0.0,
+            range_max=limit,
+        )
+        self._is_guessed = geometry.is_guessed
         return make_scan(ranges, geometry, range_max=self._range_max)
 
 
@@ -192,15 +203,31 @@ def _name_columns(cells: Sequence[bytes]) -> _Columns:
         for meaning, names in _NAMES.items():
             if name in names and meaning not in named:
                 named[meaning] = at
-    order = [readings[number] for number in sorted(readings)]
-    return _Columns(len(cells), order if len(order) >= _FEWEST_READINGS else (), named)
+    if len(readings) < _FEWEST_READINGS:
+        return _Columns(len(cells), (), named)
+    numbers = sorted(readings)
+    order = [readings[number] for number in numbers]
+    missing = (number for number in range(numbers[0], numbers[-1]) if number not in readings)
+    return _Columns(len(cells), order, named, next(missing, None))
+
+
+def _numbers(words: Sequence[bytes]) -> list[float]:
+    """Read cells as numbers, empty ones as NaN.
+
+    Raises:
+        ValueError: One is no number; the message names it.
+    """
+    try:
+        return [float(word.strip() or b"nan") for word in words]
+    except ValueError:
+        raise ValueError(f"not a number: {shown(_first_word(words))}") from None
 
 
 def _first_word(cells: Sequence[bytes]) -> bytes:
     """Return the first cell that is not a number, nothing where all are."""
     for cell in cells:
         try:
-            float(cell or b"nan")
+            float(cell.strip() or b"nan")
         except ValueError:
             return cell
     return b""

@@ -8,14 +8,22 @@ Readings run counter-clockwise and lie symmetrically about forward.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..scan import LaserScan
 
-__all__ = ["RANGE_MAX", "ScanGeometry", "geometry_of", "make_scan", "spread"]
+__all__ = [
+    "RANGE_MAX",
+    "Angles",
+    "ScanGeometry",
+    "geometry_note",
+    "geometry_of",
+    "make_scan",
+    "spread",
+]
 
 RANGE_MAX = 80.0
 """Limit of a sensor that nobody said anything about, metres."""
@@ -50,12 +58,63 @@ class ScanGeometry:
         angle_increment: Angle between readings, radians.
         range_min: Below this range a reading is no return, metres.
         range_max: From this range on a reading is no return, metres.
+        is_guessed: Whether nothing but the number of readings tells.
     """
 
     angle_min: float
     angle_increment: float
     range_min: float = 0.0
     range_max: float = RANGE_MAX
+    is_guessed: bool = False
+
+
+@dataclass(frozen=True)
+class Angles:
+    """What a table says of where the readings of a scan look, radians; two of three are enough.
+
+    Args:
+        angle_min: Direction of the first reading.
+        angle_max: Direction of the last reading.
+        angle_increment: Angle between readings.
+    """
+
+    angle_min: float | None = None
+    angle_max: float | None = None
+    angle_increment: float | None = None
+
+    def geometry(
+        self, count: int, *, field_of_view: float | None, range_min: float, range_max: float
+    ) -> ScanGeometry:
+        """Return the geometry of ``count`` readings.
+
+        Args:
+            count: Number of readings.
+            field_of_view: Angle that they cover instead, radians.
+            range_min: Below this range a reading is no return, metres.
+            range_max: From this range on a reading is no return, metres.
+
+        Raises:
+            ValueError: One angle alone does not tell, or none is given and the number does not.
+        """
+        start, end, step = self.angle_min, self.angle_max, self.angle_increment
+        if field_of_view is not None:
+            return ScanGeometry(*spread(field_of_view, count), range_min, range_max)
+        told = [name for name, value in vars(self).items() if value is not None]
+        if not told:
+            return replace(geometry_of(count, range_max=range_max), range_min=range_min)
+        if len(told) == 1:
+            raise ValueError(
+                f"{told[0]} alone does not say where the readings look; give two of angle_min, "
+                "angle_max and angle_increment, or the field of view (field_of_view, "
+                "--field-of-view)"
+            )
+        if step is None and start is not None and end is not None:
+            step = (end - start) / max(count - 1, 1)
+        if start is None and end is not None and step is not None:
+            start = end - (count - 1) * step
+        assert start is not None
+        assert step is not None
+        return ScanGeometry(start, step, range_min, range_max)
 
 
 def geometry_of(
@@ -83,14 +142,29 @@ def geometry_of(
     if field_of_view is not None:
         return ScanGeometry(*spread(field_of_view, count), range_max=range_max)
     known = _RESOLUTIONS.get(count if count % 2 else count + 1)
-    if known is not None and not is_certain:
+    is_guessed = known is not None and not is_certain
+    if known is not None and is_guessed:
         resolution = math.radians(known)
     if resolution is None or not 0.0 < resolution * (count - 1) < _FULL_TURN:
         raise ValueError(
-            f"the field of view of {count} readings is not known; give it (field_of_view)"
+            f"the field of view of {count} readings is not known; give it "
+            "(field_of_view, --field-of-view)"
         )
     steps = count if count % 2 == 0 else count - 1
-    return ScanGeometry(-0.5 * steps * resolution, resolution, range_max=range_max)
+    start = -0.5 * steps * resolution
+    return ScanGeometry(start, resolution, range_max=range_max, is_guessed=is_guessed)
+
+
+def geometry_note(scan: LaserScan, *, is_guessed: bool) -> str:
+    """Return what is said of where the readings of a log look."""
+    start, end = math.degrees(scan.angles[0]), math.degrees(scan.angles[-1])
+    note = f"{len(scan)} readings from {start:g} to {end:g} degrees, up to {scan.range_max:g} m"
+    if not is_guessed:
+        return note
+    return (
+        f"{note}; guessed from their number, give the field of view (field_of_view, "
+        "--field-of-view) if it is another, such as 360 degrees"
+    )
 
 
 def spread(field_of_view: float, count: int) -> tuple[float, float]:

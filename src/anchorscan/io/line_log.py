@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from abc import abstractmethod
 from collections import defaultdict
 from collections.abc import Iterator
@@ -10,6 +9,7 @@ from collections.abc import Iterator
 from ..errors import LogError, ScanError
 from ..record import Record
 from ..scan import LaserScan
+from .geometry import geometry_note
 from .log import Log, Report
 from .scan_line import BadLine, ScanLine
 from .survey import Survey
@@ -37,6 +37,7 @@ class LineLog(Log):
         self._text = text
         self._range_max = range_max
         self._has_corrected_poses = has_corrected_poses
+        self._is_guessed = False
         self._surveys: dict[bytes, tuple[int, Survey]] = {}
         self.count, first = self._look_through()
         self.notes = tuple(self._say(first))
@@ -63,6 +64,7 @@ class LineLog(Log):
                 continue
             surveys[line.kind][line.tail_length].add(line)
             if first is None:
+                self._is_guessed = line.geometry.is_guessed
                 first, reason = self._scan(line)
                 complain(line.number, reason)
         if first is None:
@@ -76,8 +78,7 @@ class LineLog(Log):
         return count, first
 
     def _say(self, scan: LaserScan) -> Iterator[str]:
-        start, end = math.degrees(scan.angles[0]), math.degrees(scan.angles[-1])
-        yield f"{len(scan)} readings from {start:g} to {end:g} degrees, up to {scan.range_max:g} m"
+        yield geometry_note(scan, is_guessed=self._is_guessed)
         for kind, (_, survey) in sorted(self._surveys.items()):
             name = kind.decode()
             poses = "poses" if self._has_corrected_poses else "odometry"

@@ -6,7 +6,8 @@ Arrays of an ``.npz`` archive, all metres, radians and seconds:
 * ``poses`` (N, 3): ``T_map_laser`` as x, y, theta; NaN where unknown;
 * ``odometry`` (N, 3): ``T_odom_laser`` as x, y, theta; NaN where unknown;
 * ``stamps`` (N,);
-* ``angle_min``, ``angle_increment``, ``range_min``, ``range_max``: one number, or (N,);
+* ``angle_min``, ``angle_max``, ``angle_increment``, ``range_min``, ``range_max``: one number,
+  or (N,); two of the three angles are enough, and one alone is refused;
 * ``T_base_laser`` (3,): where the laser sits on the robot.
 
 Ranges are read a row at a time, and nothing is set aside because a header promises it.
@@ -31,7 +32,7 @@ from ..record import Record
 from ..scan import LaserScan
 from .archive import BROKEN, ZIP_MAGIC, member_names, open_member
 from .bounded_file import BoundedPath
-from .geometry import RANGE_MAX, ScanGeometry, geometry_of, make_scan, spread
+from .geometry import RANGE_MAX, Angles, geometry_note, make_scan
 from .log import Log, Report
 
 __all__ = ["NumpyLog", "is_numpy"]
@@ -46,6 +47,7 @@ _SIDE_ARRAYS = (
     "odometry",
     "stamps",
     "angle_min",
+    "angle_max",
     "angle_increment",
     "range_min",
     "range_max",
@@ -100,9 +102,12 @@ class NumpyLog(Log):
             raise LogError(f"ranges promise {header.shape[-1]} readings a scan", path)
         self.count = rows
         self._sides = self._read_sides(rows) if self._is_archive else {}
-        if not any(record.scan is not None for record in self):
+        self._is_guessed = False  # of the latest scan
+        first = next((record.scan for record in self if record.scan is not None), None)
+        if first is None:
             problem = self.problems[0].reason if self.problems else "it has no rows"
             raise LogError(f"no readable laser scan: {problem}", path)
+        self.notes = (geometry_note(first, is_guessed=self._is_guessed),)
 
     def _read(self, report: Report) -> Iterator[Record]:
         mounting = self._pose("T_base_laser", None)
@@ -124,18 +129,20 @@ class NumpyLog(Log):
 
     def _scan(self, index: int, row: NDArray[np.float64]) -> tuple[LaserScan | None, str]:
         try:
-            count = len(row)
             limit = self._number("range_max", index)
             limit = RANGE_MAX if limit is None else limit
-            start = self._number("angle_min", index)
-            increment = self._number("angle_increment", index)
-            if self._field_of_view is not None:
-                start, increment = spread(self._field_of_view, count)
-            if start is None or increment is None:
-                guess = geometry_of(count, range_max=limit)
-                start, increment = guess.angle_min, guess.angle_increment
-            shortest = self._number("range_min", index) or 0.0
-            geometry = ScanGeometry(start, increment, shortest, limit)
+            angles = Angles(
+                self._number("angle_min", index),
+                self._number("angle_max", index),
+                self._number("angle_increment", index),
+            )
+            geometry = angles.geometry(
+                len(row),
+                field_of_view=self._field_of_view,
+                range_min=self._number("range_min", index) or 0.0,
+                range_max=limit,
+            )
+            self._is_guessed = geometry.is_guessed
             return make_scan(row, geometry, range_max=self._range_max), ""
         except (ValueError, ScanError) as error:
             return None, str(error)

@@ -77,8 +77,8 @@ class PosedLog(Log):
             if record.T_base_laser is None:
                 raise LogError(
                     "where the laser sits on the robot is not known, so poses of the robot say "
-                    "nothing of it; give it (T_base_laser), or say that they are the laser's "
-                    "(poses_of)",
+                    "nothing of it; give it (T_base_laser, --laser), or say that they are the "
+                    "laser's (poses_of, --poses-of)",
                     self._log.path,
                 )
             pose = pose @ record.T_base_laser

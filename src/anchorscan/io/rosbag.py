@@ -45,6 +45,8 @@ __all__ = ["BagLog", "BagOptions", "find_bag"]
 
 _ROS1_MAGIC = b"#ROSBAG V"
 _STORAGE_MAGICS = {".db3": b"SQLite format 3\x00", ".mcap": b"\x89MCAP0\r\n"}
+# Which application a SQLite file is of: a reference set says this.
+_APPLICATION_AT, _SET_APPLICATION = slice(68, 72), b"APRS"
 _TF = "/tf"
 _USUAL_BASES = ("base_link", "base_footprint", "base")
 _USUAL_ODOMETRY = ("odom", "odometry")
@@ -104,7 +106,7 @@ def find_bag(path: Path, magic: bytes) -> tuple[str, list[Path]] | None:
         magic: The first bytes of the file, none of a folder.
 
     Raises:
-        LogError: The file has the wrong ending for what it is.
+        LogError: The file has the wrong ending for what it is, or is a reference set.
     """
     if path.is_dir():
         if (path / "metadata.yaml").is_file():
@@ -113,6 +115,10 @@ def find_bag(path: Path, magic: bytes) -> tuple[str, list[Path]] | None:
         return ("rosbag2", parts) if parts else None
     if magic.startswith(_ROS1_MAGIC):
         return "ROS 1 bag", [path]
+    if magic.startswith(_STORAGE_MAGICS[".db3"]) and magic[_APPLICATION_AT] == _SET_APPLICATION:
+        raise LogError(
+            "is a reference set, not a log; a command names the set before the log", path
+        )
     for ending, begin in _STORAGE_MAGICS.items():
         if magic.startswith(begin):
             if path.suffix != ending:
@@ -124,7 +130,10 @@ def find_bag(path: Path, magic: bytes) -> tuple[str, list[Path]] | None:
 def _whole(path: Path) -> Path:
     """Return the folder of a storage file that is all of a recording: it tells of compression."""
     folder = path.absolute().parent
-    storages = [part for part in folder.iterdir() if part.suffix in _STORAGE_MAGICS]
+    try:
+        storages = [part for part in folder.iterdir() if part.suffix in _STORAGE_MAGICS]
+    except OSError:  # a folder that may not be listed
+        return path
     return folder if (folder / "metadata.yaml").is_file() and len(storages) == 1 else path
 
 
@@ -171,7 +180,9 @@ class BagLog(Log):
         if len(filled) == 1:
             return filled[0]
         if filled:
-            raise LogError(f"several topics of laser scans: {listed}; choose one", self.path)
+            raise LogError(
+                f"several topics of laser scans: {listed}; choose one (topic, --topic)", self.path
+            )
         others = ", ".join(sorted(recording.topics)[:_SHOWN_TOPICS])
         raise LogError(f"no laser scans; the topics are {others or 'none'}", self.path)
 
@@ -195,7 +206,7 @@ class BagLog(Log):
         yield f"scans from {self._topic}, frame {self._frame or 'without a name'}"
         mounting = self._T_base_laser
         if mounting is None:
-            yield "where the laser sits on the robot is not known (T_base_laser)"
+            yield "where the laser sits on the robot is not known (T_base_laser, --laser)"
         else:
             yield (
                 f"the laser sits {mounting.x:.3f} m ahead and {mounting.y:.3f} m left on the "
@@ -219,8 +230,11 @@ class BagLog(Log):
             return Record(number - 1, None, None, None, time, source, problem)
         stamp = stamp_of(message.header, time)
         if frame_name(message.header.frame_id) != self._frame:
-            report(number, f"the scan is of another frame, {message.header.frame_id!r}")
-            return Record(number - 1, scan, None, None, stamp, source, problem)
+            # Another laser, which may hang where this one stands.
+            other = f"the scan is of another frame, {message.header.frame_id!r}"
+            if scan is not None:
+                report(number, other)
+            return Record(number - 1, None, None, None, stamp, source, problem or other)
         return Record(
             number - 1,
             scan,
@@ -267,6 +281,7 @@ class _Setup:
         child = recording.child_of(self._odometry_topic)
         named = options.base_frame_id
         self._bases = [frame_name(named)] if named else [child, *_USUAL_BASES]
+        self._told_base, self._told_mounting = self._read_mounting()
         self._base, self._mounting = self._find_mounting()
 
     @property
@@ -281,16 +296,19 @@ class _Setup:
         Raises:
             LogError: It does neither stand nor hang.
         """
-        angle = 0.0 if self._mounting is None else tilt(self._mounting)
-        if _LEVEL < angle < math.pi - _LEVEL:
+        angle = 0.0 if self._told_mounting is None else tilt(self._told_mounting)
+        is_given = self._options.T_base_laser is not None
+        if _LEVEL < angle < math.pi - _LEVEL and not is_given:
             raise LogError(
                 f"the laser ({self._laser}) is tilted by {math.degrees(angle):.0f} degrees, so "
-                "its scans do not show the walls of a plan; if /tf is wrong, give T_base_laser",
+                "its scans do not show the walls of a plan; if /tf is wrong, say where it sits "
+                "(T_base_laser, --laser)",
                 self._path,
             )
         if self._options.is_upside_down is not None:
             return self._options.is_upside_down
-        return angle > math.pi - _LEVEL
+        # A place given in the plane does not say which way up.
+        return angle > math.pi / 2.0
 
     def odometry(self) -> _Source | None:
         """Return ``T_odom_laser`` over time, or None where nothing tells."""
@@ -317,8 +335,8 @@ class _Setup:
         if source is None:
             raise LogError(
                 f"where the laser ({self._laser or 'without a frame'}) sits on the robot is not "
-                f"in /tf, so the poses on {topic} say nothing of it; give it (T_base_laser), or "
-                "say that they are the laser's (poses_of)",
+                f"in /tf, so the poses on {topic} say nothing of it; give it (T_base_laser, "
+                "--laser), or say that they are the laser's (poses_of, --poses-of)",
                 self._path,
             )
         return source
@@ -342,6 +360,10 @@ class _Setup:
         if given is not None:
             known = (base for base in self._bases if base and base in self._tree)
             return next(known, self._bases[0] or _USUAL_BASES[0]), from_pose(given)
+        return self._told_base, self._told_mounting
+
+    def _read_mounting(self) -> tuple[str, NDArray[np.float64] | None]:
+        """Return the name of the base and ``T_base_laser`` in space, as ``/tf`` has them."""
         for base in self._bases:
             if base and self._laser:
                 same = base == self._laser

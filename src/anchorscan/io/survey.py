@@ -26,6 +26,8 @@ _CHANGED_RANGE = 0.25
 # Poses that differ by less than the printed digits are one, metres and radians.
 _SAME = 2e-3
 _DAMAGED = 0.01
+# Ways in which the columns may differ; more than one, as the first line may be the damaged one.
+_KEPT_RELATIVES = 3
 
 
 class Survey:
@@ -38,8 +40,10 @@ class Survey:
         self._first: ScanLine | None = None
         self._change = 0.0
         self._has_stamps = False
-        self._relative: Pose2D | None = None
-        self._apart = 0
+        # The first few ways in which the columns differ, and how many lines differ so.
+        self._relatives: list[Pose2D] = []
+        self._alike: list[int] = []
+        self._compared = 0
 
     def add(self, line: ScanLine) -> None:
         """Count one scan line."""
@@ -48,10 +52,7 @@ class Survey:
         self._odometry.add(line.robot)
         self._has_stamps = self._has_stamps or bool(line.stamp)
         if line.laser is not None and line.robot is not None:
-            relative = line.robot.inverse() @ line.laser
-            if self._relative is None:
-                self._relative = relative
-            self._apart += not _is_same(relative, self._relative)
+            self._add_relative(line.robot.inverse() @ line.laser)
         if not (self._poses.moves and self._odometry.moves):
             self._compare(line)
 
@@ -59,15 +60,16 @@ class Survey:
     def is_one_trajectory(self) -> bool:
         """Whether poses and odometry are one trajectory, perhaps of two places on the robot."""
         # A damaged number here and there does not make a second trajectory.
-        return self._apart <= _DAMAGED * self.count
+        return self._compared - max(self._alike, default=0) <= _DAMAGED * self.count
 
     @property
     def relative(self) -> Pose2D | None:
         """``T_base_laser`` as the columns have it, where they are one trajectory of two bodies."""
-        if not self.is_one_trajectory or self._relative is None:
+        if not self.is_one_trajectory or not self._relatives:
             return None
+        relative = self._relatives[self._alike.index(max(self._alike))]
         # Two equal columns may be those of one body as well as of two that coincide.
-        return None if _is_same(self._relative, Pose2D()) else self._relative
+        return None if _is_same(relative, Pose2D()) else relative
 
     @property
     def has_poses(self) -> bool:
@@ -89,6 +91,17 @@ class Survey:
     @property
     def _scans_change(self) -> bool:
         return self._change > _CHANGED_RANGE
+
+    def _add_relative(self, relative: Pose2D) -> None:
+        """Count a line as one of those whose columns differ alike."""
+        self._compared += 1
+        for number, known in enumerate(self._relatives):
+            if _is_same(relative, known):
+                self._alike[number] += 1
+                return
+        if len(self._relatives) < _KEPT_RELATIVES:
+            self._relatives.append(relative)
+            self._alike.append(1)
 
     def _compare(self, line: ScanLine) -> None:
         """Keep how far the readings of a laser that claims to stand still have changed."""

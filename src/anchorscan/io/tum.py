@@ -10,6 +10,7 @@ from ..errors import LogError
 from ..pose import Pose2D
 from .text import TextFile, shown
 from .trajectory import Trajectory
+from .whole_file import writing
 
 __all__ = ["read_tum", "write_tum"]
 
@@ -57,7 +58,7 @@ def write_tum(path: str | Path, poses: Iterable[tuple[float, Pose2D]]) -> int:
     A place that is not known is left out, not written as zero.
 
     Args:
-        path: The file to write.
+        path: The file to write, which appears when it is whole.
         poses: Time (seconds) and pose of whatever frame the caller follows, in order.
 
     Returns:
@@ -67,17 +68,14 @@ def write_tum(path: str | Path, poses: Iterable[tuple[float, Pose2D]]) -> int:
         LogError: The file cannot be written, or a pose is not finite.
     """
     count = 0
-    try:
-        with Path(path).open("w", encoding="ascii", newline="\n") as stream:
-            for stamp, pose in poses:
-                if not (math.isfinite(stamp) and pose.is_finite()):
-                    raise LogError(f"pose {count} is not finite, so it is not written", path)
-                half = 0.5 * pose.theta
-                stream.write(
-                    f"{stamp:.9f} {pose.x:.9f} {pose.y:.9f} 0 "
-                    f"0 0 {math.sin(half):.12f} {math.cos(half):.12f}\n"
-                )
-                count += 1
-    except OSError as error:
-        raise LogError(f"cannot be written: {error.strerror}", path) from None
+    with writing(path) as stream:
+        for stamp, pose in poses:
+            if not (math.isfinite(stamp) and pose.is_finite()):
+                raise LogError(f"pose {count} is not finite, so it is not written", path)
+            half = 0.5 * pose.theta
+            stream.write(
+                f"{stamp:.9f} {pose.x:.9f} {pose.y:.9f} 0 "
+                f"0 0 {math.sin(half):.12f} {math.cos(half):.12f}\n"
+            )
+            count += 1
     return count
