@@ -286,6 +286,7 @@ def _tracked(
 ) -> Iterator[dict[str, Any]]:
     """Yield the line of ``track`` for every record."""
     from ..localizer import Localizer
+    from ..pose import Pose2D
     from ..reference_set import ReferenceSet
 
     places = ReferenceSet.open(set_file, settings=settings)
