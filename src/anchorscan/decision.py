@@ -111,7 +111,8 @@ class DecisionSettings(BaseModel):
         0.012, gt=0.0, description="how far the scores of equal places lie apart, root mean square"
     )
     both_ways: bool = Field(
-        False, description="accept only what fits better than upside down; takes twice as long"
+        False,
+        description="accept only what fits better than upside down, in a map; takes twice as long",
     )
     most_alike: int = Field(3, ge=1, description="places that an ambiguous answer names at most")
     widest_deviation: float = Field(
