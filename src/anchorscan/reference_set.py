@@ -684,7 +684,11 @@ class ReferenceSet:
         matcher = self._matcher
         if matcher is None:
             with self._lock:
-                matcher = self._matcher or self._indexed() or self._derived()
+                matcher = self._matcher
+                if matcher is None:
+                    matcher = self._indexed()
+                if matcher is None:
+                    matcher = self._derived()
                 self._matcher = matcher
         return matcher
 
