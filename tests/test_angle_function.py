@@ -57,7 +57,7 @@ def plain_sweep(scan):
     """Rows of step, direction and range of the returns, the free steps, and the sweep's length."""
     count = len(scan)
     step = abs(scan.angle_increment)
-    while count > 1 and (count - 0.5) * step > 2.0 * math.pi:
+    while count > 2 and (count - 0.5) * step > 2.0 * math.pi:
         count -= 1
     rows, free = [], set()
     order = range(count) if scan.angle_increment > 0.0 else range(count - 1, -1, -1)
@@ -446,3 +446,10 @@ def test_scans_with_nothing_to_tell_have_no_surface(ranges):
     angles = angle_function(LaserScan.from_field_of_view(ranges, math.pi), FITTED)
     assert np.all(np.isnan(angles.surface))
     assert np.all(angle_histogram(angles, FITTED) == 0.0)
+
+
+@pytest.mark.parametrize("increment", [4.5, 5.5, 6.2, -5.5])
+def test_of_two_readings_the_second_is_no_second_look(increment):
+    scan = LaserScan([0.0, 5.0], 0.0, increment)
+    expected = (5.0 * math.cos(increment), 5.0 * math.sin(increment))
+    np.testing.assert_allclose(angle_function(scan, CHORD).points, [expected], atol=1e-6)

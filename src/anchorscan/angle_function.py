@@ -179,7 +179,7 @@ def _returns(ranges, geometry):  # type: ignore[no-untyped-def]
     angle_min, increment, range_min, range_max = geometry
     step = abs(increment)
     count = len(ranges)
-    if count > 1:
+    if count > 2:  # two never come to a second look
         count = min(count, int(math.floor(2.0 * math.pi / step + 0.5)))
     points = np.empty((count, 2))
     out = np.empty(count)
