@@ -228,32 +228,28 @@ def test_scans_that_come_late_or_twice_are_left_out() -> None:
     assert tracker.resets == 0
 
 
-def test_a_clock_that_goes_back_starts_over() -> None:
+@pytest.mark.parametrize(
+    ("taken", "newest", "late", "back"),
+    [
+        pytest.param(1000.0, 1000.2, 999.5, 3.0, id="while scans are taken"),
+        # An idle node takes scans no more, and a recording begins again.
+        pytest.param(10.0, 221.0, 220.5, 12.0, id="while no scan is taken"),
+    ],
+)
+def test_a_clock_that_goes_back_starts_over(
+    taken: float, newest: float, late: float, back: float
+) -> None:
     tracker = Fixed(0.9)
     robot = Robot(tracker)
-    robot.take(SCAN, 1000.0)
+    robot.take(SCAN, taken)
     robot.is_announced = True
-    robot.watch_clock(1000.2)
-    robot.watch_clock(999.5)
+    robot.watch_clock(newest)
+    robot.watch_clock(late)
     assert robot.is_announced
-    robot.watch_clock(3.0)
+    robot.watch_clock(back)
     assert not robot.is_announced
     assert tracker.resets == 1
-    assert robot.take(SCAN, 3.0) is not None
-
-
-def test_a_clock_that_goes_back_while_no_scan_is_taken_starts_over() -> None:
-    """As an idle node sees it: it takes scans no more, and a recording begins again."""
-    tracker = Fixed(0.9)
-    robot = Robot(tracker)
-    robot.take(SCAN, 10.0)
-    robot.is_announced = True
-    robot.watch_clock(221.0)
-    robot.watch_clock(220.5)
-    assert robot.is_announced
-    robot.watch_clock(12.0)
-    assert not robot.is_announced
-    assert tracker.resets == 1
+    assert robot.take(SCAN, back) is not None
 
 
 def test_a_scan_that_waited_while_others_were_seen_is_taken() -> None:

@@ -360,8 +360,7 @@ def _sealed(data: bytes, folder: Path) -> None:
     try:
         with ReferenceSet.open(path) as places:
             _check_set(places)
-            for hypothesis in places.locate(_rooms()[0].scan):
-                _check_hypothesis(hypothesis)
+            _ask(places)
     except AnchorscanError as error:
         _one_line(error)
 
@@ -476,8 +475,8 @@ def _serve_arrays(
     deed(matcher)
 
 
-def _ask(matcher: Matcher, candidates: int | None = None) -> None:
-    for hypothesis in matcher.locate(_rooms()[0].scan, candidates):
+def _ask(places: Matcher | ReferenceSet, candidates: int | None = None) -> None:
+    for hypothesis in places.locate(_rooms()[0].scan, candidates):
         _check_hypothesis(hypothesis)
 
 
@@ -509,20 +508,17 @@ def _serve_file(content: bytes, arrays: dict[str, np.ndarray], kind: int, folder
     path.write_bytes(content)
     room = dict.fromkeys(("field.codes", "field.coarse"), 8)
     write_arrays(index_path(path), arrays, _made_of(_INDEXED[kind]), room)
-    asked = _rooms()[0].scan
     with ReferenceSet.open(path, settings=_INDEXED[kind]) as places:  # not read every time
         places._matcher = places._indexed()
         if places._matcher is None:  # without its index the set is the same every time
             _check_set(places)
             return
-        for candidates in (None, 1):
-            for hypothesis in places.locate(asked, candidates):
-                _check_hypothesis(hypothesis)
+        _ask(places)
+        _ask(places, 1)
         _check_set(places)
-        places.add(asked, Pose2D(20.0, 3.0, 1.0))
+        places.add(_rooms()[0].scan, Pose2D(20.0, 3.0, 1.0))
         places.remove(0)
-        for hypothesis in places.locate(asked):
-            _check_hypothesis(hypothesis)
+        _ask(places)
 
 
 def _directory(data: bytes, folder: Path) -> None:

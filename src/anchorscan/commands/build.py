@@ -161,9 +161,10 @@ def add(
 
     if any(map(_is_map, logs)):
         raise typer.BadParameter("a map is built from alone: it cannot be added")
+    told = {**reading.reading(), **posing.posing()}
     with ReferenceSet.open(set_file) as places:
         for path in logs:
-            log = open_log(path, **reading.reading(), **posing.posing())
+            log = open_log(path, **told)
             refuse_mirrored(places, log)
             refuse_another_frame(places, log)
             before = len(places)

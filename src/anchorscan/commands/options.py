@@ -91,6 +91,16 @@ def _fields(group: Any) -> list[inspect.Parameter]:
     ]
 
 
+def _doubt_narrow(degrees: float | None) -> float | None:
+    """Warn once of a field of view that was probably meant in radians."""
+    if degrees is not None and 0.0 < degrees < _NARROW:
+        say(
+            f"warning: --field-of-view {degrees:g} is very narrow for a laser: it is given in "
+            f"degrees, and {degrees:g} radians are {math.degrees(degrees):.0f} degrees"
+        )
+    return degrees
+
+
 def _parse_candidates(text: str) -> int | str:
     if text == "all":
         return text
@@ -141,7 +151,11 @@ SetArgument = Annotated[Path, typer.Argument(metavar="SET", help="A reference se
 LogArgument = Annotated[Path, typer.Argument(metavar="LOG", help="A log of laser scans.")]
 FieldOfViewOption = Annotated[
     float | None,
-    typer.Option(metavar="DEG", help="What the readings cover, if the log does not tell."),
+    typer.Option(
+        callback=_doubt_narrow,
+        metavar="DEG",
+        help="What the readings cover, if the log does not tell.",
+    ),
 ]
 RangeMaxOption = Annotated[
     float | None,
@@ -210,12 +224,6 @@ class LogOptions:
     def reading(self) -> dict[str, Any]:
         """Return it as ``open_log`` wants it."""
         field_of_view = self.field_of_view
-        if field_of_view is not None and 0.0 < field_of_view < _NARROW:
-            say(
-                f"warning: --field-of-view {field_of_view:g} is very narrow for a laser: it is "
-                f"given in degrees, and {field_of_view:g} radians are "
-                f"{math.degrees(field_of_view):.0f} degrees"
-            )
         return {
             "field_of_view": None if field_of_view is None else math.radians(field_of_view),
             "range_max": self.range_max,
